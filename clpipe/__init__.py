@@ -21,26 +21,18 @@ if TYPE_CHECKING:
     from clpipe.pipeline import Pipeline
     from clpipe.stream import Shot, Stream
 
-_MODULES = {
-    "Camera": "clpipe.camera.profile",
-    "ClpipeError": "clpipe.base.errors",
-    "Dataset": "clpipe.dataset",
-    "DeviceError": "clpipe.base.errors",
-    "ImageError": "clpipe.base.errors",
-    "NoiseModel": "clpipe.camera.noise",
-    "Outcome": "clpipe.batch.outcome",
-    "Patches": "clpipe.dataset",
-    "Pipeline": "clpipe.pipeline",
-    "RawNoise": "clpipe.dataset",
-    "RequestError": "clpipe.base.errors",
-    "Result": "clpipe.engine.runner",
-    "Run": "clpipe.batch.session",
-    "Shot": "clpipe.stream",
-    "Stream": "clpipe.stream",
-    "StreamingDataset": "clpipe.dataset.streaming",
-    "built_in_cameras": "clpipe.camera.profile",
-    "load_camera": "clpipe.camera.profile",
-    "run": "clpipe.batch.api",
+_NAMES = {
+    "clpipe.base.errors": ("ClpipeError", "DeviceError", "ImageError", "RequestError"),
+    "clpipe.batch.api": ("run",),
+    "clpipe.batch.outcome": ("Outcome",),
+    "clpipe.batch.session": ("Run",),
+    "clpipe.camera.noise": ("NoiseModel",),
+    "clpipe.camera.profile": ("Camera", "built_in_cameras", "load_camera"),
+    "clpipe.dataset": ("Dataset", "Patches", "RawNoise"),
+    "clpipe.dataset.streaming": ("StreamingDataset",),
+    "clpipe.engine.runner": ("Result",),
+    "clpipe.pipeline": ("Pipeline",),
+    "clpipe.stream": ("Shot", "Stream"),
 }
 
 __all__ = [
@@ -68,9 +60,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+    for module, names in _NAMES.items():
+        if name in names:
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -18,7 +18,7 @@ from clpipe.chain.chain import Chain
 from clpipe.chain.entering import prepare_image
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
-from clpipe.chain.layers import layer_of_array, layer_steps
+from clpipe.chain.layers import layer_of_array, layer_steps, reader_of
 from clpipe.chain.making import make_chain
 from clpipe.chain.methods import base_name
 from clpipe.chain.overscan import margins_of_array
@@ -41,9 +41,6 @@ from clpipe.stage import ImageLayer, Kind
 
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
-
-# A setting that reads a layer, by its kind.
-READERS = {"depth": "defocus.method=thin_lens", "flow": "temporal_denoise.method=flow"}
 
 
 class Prepared(NamedTuple):
@@ -277,7 +274,7 @@ class Pipeline(ReadOnly):
 
         entered = prepare_image(chain, checked, margins, layer)
         unread = sorted(arrays.keys() - {each.kind for each in entered.layers.values()})
-        notes = [f"no step reads the {kind}. Set {READERS[kind]} to use it" for kind in unread]
+        notes = [f"no step reads the {kind}. Set {reader_of(kind)} to use it" for kind in unread]
         texts = (*notes, *entered.warnings)
         chain, pixels = entered.chain, entered.pixels
         if earlier:

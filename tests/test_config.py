@@ -130,10 +130,7 @@ def test_parameters_come_from_the_camera_and_from_each_other():
 
 def test_without_its_inverse_white_balance_takes_nothing_in():
     chain = build(skip=["inverse_white_balance"])
-    assert chain.step_named("white_balance").method.model_dump() == {
-        "red_gain": 1,
-        "blue_gain": 1,
-    }
+    assert chain.step_named("white_balance").method.model_dump() == {"red_gain": 1, "blue_gain": 1}
 
 
 def test_a_repeated_stage_has_settings_of_its_own():

@@ -1,18 +1,45 @@
-"""The generated source of the Python API matches the stages and options."""
+"""The keywords and the docstring of the Python API match the stages and options."""
 
 import inspect
+import re
 import typing
 
 import pytest
 
 from clpipe.batch.api import run
+from clpipe.camera.profile import DEFAULT_CAMERA
+from clpipe.chain.files import built_in_configs
+from clpipe.chain.keys import CODE, DEFAULT_ISO, KEYS
 from clpipe.chain.options import OPTIONS
-from tools.pages.keywords import API, PATH, api_text, text_of
+from clpipe.commands.chain_options import ARGUMENTS, described
+from clpipe.images.dump import TYPES
+from clpipe.images.pixels import DEFAULT_MAX_PIXELS
+from clpipe.images.video import DEFAULT_CRF
+from tools.pages.keywords import PATH, text_of
 
 
-@pytest.mark.parametrize(("path", "text"), [(PATH, text_of), (API, api_text)])
-def test_what_is_written_follows_from_stages_and_options(path, text):
-    assert path.read_text("utf-8") == text(), "write it again: tools/run pages keywords"
+def test_what_is_written_follows_from_stages():
+    assert PATH.read_text("utf-8") == text_of(), "write it again: tools/run pages keywords"
+
+
+DEFAULTS = {"camera": DEFAULT_CAMERA, "iso": DEFAULT_ISO, "crf": DEFAULT_CRF}
+DEFAULTS |= {"max_pixels": DEFAULT_MAX_PIXELS}
+
+
+@pytest.mark.parametrize("name", sorted(ARGUMENTS.keys() & OPTIONS))
+def test_the_docstring_names_choices_and_defaults(name):
+    entry, choices = ARGUMENTS[name], OPTIONS[name].choices
+    named = re.findall(r'"([a-z\d]+)"', entry.partition("The choices are")[2])
+    assert named == list(choices)
+    default = described(OPTIONS[name]).default_text
+    assert name not in DEFAULTS or default == f"{DEFAULTS[name]}".removesuffix(".0")
+    assert not choices or default == "" or default.partition(";")[0] in choices
+
+
+def test_docstrings_name_configurations_and_types():
+    assert f"ones are {', '.join(built_in_configs())}." in ARGUMENTS["config"]
+    assert f"types are {', '.join(TYPES)}." in KEYS["dump"].text
+    assert all(key.text for name, key in KEYS.items() if name != CODE)
 
 
 def test_types_of_arguments_are_those_of_the_options():

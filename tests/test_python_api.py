@@ -51,10 +51,9 @@ def test_every_parameter_is_documented_and_none_has_an_empty_default(function, o
 
 def test_the_type_checkers_names_are_the_lazy_ones():
     text = (ROOT / "clpipe" / "__init__.py").read_text()
-    block = text[text.index("if TYPE_CHECKING") : text.index("_MODULES")]
-    for name, module in clpipe._MODULES.items():
-        (line,) = (x for x in block.splitlines() if f"from {module} import " in x)
-        assert name in line.partition(" import ")[2].split(", ")
+    for module, names in clpipe._NAMES.items():
+        assert f"    from {module} import {', '.join(names)}\n" in text
+    assert {name for names in clpipe._NAMES.values() for name in names} < {*clpipe.__all__}
 
 
 def test_importing_it_imports_nothing_heavy():

@@ -69,10 +69,7 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
         (('"vignette", "Darken', '"denoise_2", "Darken'), "does not end in a digit"),
         (("(CosineFourth,)", "(CosineFourth)"), r"the methods of vignette must be a tuple"),
         (('    method: ClassVar = "cosine_fourth"\n', ""), "CosineFourth lacks method"),
-        (
-            ("Kind.RGB, Kind.RGB", "Kind.RGB, Kind.RBG"),
-            r"py, line \d\d: AttributeError: RBG",
-        ),
+        (("Kind.RGB, Kind.RGB", "Kind.RGB, Kind.RBG"), r"py, line \d\d: AttributeError: RBG"),
         (('"px", gt=0)', '"px", gtt=0)'), r"vignette.py, line \d\d: TypeError: .*gtt; limits are"),
         (('kernel: ClassVar = "vignette"', 'kernel: ClassVar = "vig"'), "vig.cl does not exist"),
     ],

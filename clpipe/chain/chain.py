@@ -36,17 +36,6 @@ from clpipe.stage import (
 )
 from clpipe.stages.shutter import Rows
 
-# Computed properties of a chain; the second tuple has those that depend only on its structure.
-COMPUTED = "optics", "filter_array", "context_after", "raw_context", "geometry"
-STRUCTURAL = (
-    "is_noisy",
-    "light_layer_steps",
-    "raw_step_name",
-    "result",
-    "step_names",
-    "_resamplings",
-)
-
 T = TypeVar("T")
 
 
@@ -114,7 +103,7 @@ class Chain:
     @property
     def label(self) -> str:
         """The first and the last step, as text for people."""
-        names = [step.name for step in self.steps]
+        names = self.step_names
         return f"{names[0]}..{names[-1]}" if len(names) > 1 else "".join(names)
 
     @property
@@ -264,7 +253,7 @@ class Chain:
             except NotTraceableError:
                 vars(step).pop("arguments", None)
                 is_complete = False
-        for name in (*COMPUTED, *STRUCTURAL):
+        for name in COMPUTED:
             getattr(self, name)
         _ = is_complete and self.arguments
         return with_changes(self, {"structure": {} if is_complete else None})
@@ -322,20 +311,11 @@ class Chain:
     def _with(self, methods: Sequence[tuple[Step, Method | None]], clean: bool) -> "Chain":
         """Return the chain with other methods and without noise; see :meth:`without_noise`."""
         *others, (last, method) = methods
-        contexts: dict[int, Context] = {}  # most steps share a context
-
-        def context_of(step: Step) -> Context:
-            key = id(step.context)
-            if key not in contexts:
-                contexts[key] = step.context.replace(noise=None, clean=clean)
-            return contexts[key]
-
-        steps = tuple(
-            replace(step, method=method, context=context_of(step))
-            for step, method in (*others, (last, method or Noiseless()))
-            if method
-        )
-        return replace(self, steps=steps)
+        kept = [(s, m) for s, m in (*others, (last, method or Noiseless())) if m]
+        shared = {id(step.context): step.context for step, _ in kept}  # most steps share a context
+        contexts = {key: c.replace(noise=None, clean=clean) for key, c in shared.items()}
+        steps = (replace(s, method=m, context=contexts[id(s.context)]) for s, m in kept)
+        return replace(self, steps=tuple(steps))
 
     def select(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the names of steps, each once; "all" is every step.
@@ -344,7 +324,7 @@ class Chain:
             RequestError: the chain has no such step.
         """
         if "all" in names:
-            return tuple(step.name for step in self.steps)
+            return self.step_names
         return tuple(self.step_named(name).name for name in dict.fromkeys(names))
 
     def up_to(self, names: Sequence[str]) -> "Chain":
@@ -362,10 +342,17 @@ class Chain:
         Raises:
             RequestError: the chain has no such step.
         """
-        for step in self.steps:
-            if step.name == name:
-                return step
-        raise RequestError(unknown_name("stage in this chain", name, [s.name for s in self.steps]))
+        if name not in self.step_names:
+            raise RequestError(unknown_name("stage in this chain", name, self.step_names))
+        return self.steps[self.step_names.index(name)]
+
+
+# The computed properties of a chain, apart from its arguments, which a trace may not have.
+COMPUTED = tuple(
+    name
+    for name, value in vars(Chain).items()
+    if isinstance(value, cached_property) and name != "arguments"
+)
 
 
 def cached_by_structure(function: Callable[..., T]) -> Callable[..., T]:

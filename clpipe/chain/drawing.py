@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
-from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.chain.draws import Choice, Draw, Drift, parse_draw
-from clpipe.chain.keys import KEYS
+from clpipe.chain.keys import KEYS, setting_error
 from clpipe.chain.lens_presets import PRESETS
 from clpipe.chain.limits import Limits
 from clpipe.reference.random import philox_rounds, stream_of
@@ -28,21 +27,19 @@ def parse_drawn(key: str, table: Mapping[str, Any]) -> Draw:
     if key in KEYS and not KEYS[key].is_drawn:
         drawn = ", ".join(known.name for known in KEYS.values() if known.is_drawn)
         allowed = f"{drawn} and the parameters of stages can be"
-        raise KeyedError(
-            key, f"{key}: found {dict(table)!r}, but {key} cannot be drawn; only {allowed}"
+        raise setting_error(
+            f"{key}: found {dict(table)!r}, but {key} cannot be drawn; only {allowed}"
         )
     draw = parse_draw(key, table)
     if key == "lens" and isinstance(draw, Choice) and (presets := PRESETS.keys() & draw.choice):
-        raise KeyedError(
-            key,
+        raise setting_error(
             f"lens: found {dict(table)!r}, but {sorted(presets)[0]!r} is no lens of lensfun's "
-            "database, and cannot be drawn; remove it",
+            "database, and cannot be drawn; remove it"
         )
     if (key == "camera" or key.endswith(".method")) and not isinstance(draw, Choice):
-        raise KeyedError(
-            key,
+        raise setting_error(
             f"{key}: found {dict(table)!r}, but a name can only be drawn by choice; "
-            "use {choice = ['A', 'B']}",
+            "use {choice = ['A', 'B']}"
         )
     return draw
 
@@ -63,15 +60,14 @@ def draw_order(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[
         while (leader := draws[path[-1]].follows) in draws:
             path.append(leader)
             if leader in path[:-1]:
-                raise KeyedError(
-                    key,
+                raise setting_error(
                     f"{key}: the draw follows itself: {' -> '.join(path)}; "
-                    "set one of these to a value",
+                    "set one of these to a value"
                 )
         if leader and leader not in constants:
             names = sorted({*constants, *draws} - {path[-1]})
             unknown = unknown_name("value", leader, names).replace("allowed", "set or drawn are")
-            raise KeyedError(path[-1], f"{path[-1]}: {unknown}")
+            raise setting_error(f"{path[-1]}: {unknown}")
         return len(path)
 
     return sorted(draws, key=depth)
@@ -100,7 +96,7 @@ def draw_extremes(
         try:
             extremes[key] = draw.extremes(limits(key), followed)
         except ValueError as error:
-            raise KeyedError(key, f"{key}: found {draw.record()}: {error}") from None
+            raise setting_error(f"{key}: found {draw.record()}: {error}") from None
     return extremes
 
 

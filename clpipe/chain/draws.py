@@ -11,9 +11,9 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
+from clpipe.chain.keys import setting_error
 from clpipe.chain.limits import SMALLEST_FLOAT, Limits
 
 MAX_SIGMAS = 9.0  # standard deviations; a uniform number of 52 bits gives a normal of at most 8.3
@@ -339,7 +339,7 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
         problem = unknown_name("draw", next((str(k) for k in table), ""), DISTRIBUTIONS)
         if names:
             problem = f"a draw has one distribution, but these are {' and '.join(names)}; use one"
-        raise KeyedError(key, f"{key}: found {dict(table)!r}: {problem}")
+        raise setting_error(f"{key}: found {dict(table)!r}: {problem}")
     distribution = DISTRIBUTIONS[names[0]]
     try:
         return distribution.model_validate(dict(table))
@@ -351,7 +351,7 @@ def parse_draw(key: str, table: Mapping[str, Any]) -> Draw:
             reason = unknown_name(f"key of {names[0]}", field, distribution.model_fields)
         elif fault.problem == "missing":
             reason = f"the draw {names[0]} needs this key; add it"
-        raise KeyedError(key, f"{key}: {field}: {reason}") from None
+        raise setting_error(f"{key}: {field}: {reason}") from None
 
 
 def _exp(log: float) -> float:

@@ -40,13 +40,9 @@ class Exposures:
 
     def _chain_before_merge(self, number: int) -> Chain:
         before = replace(self.chain, steps=self.chain.steps[: self.index])
-        methods = {step.name: step.method for step in before.steps}
+        shutters = {s.name: s.method for s in before.steps if isinstance(s.method, Rows)}
         return before.with_methods(
-            {
-                k: m.for_exposure(self.spans, number)
-                for k, m in methods.items()
-                if isinstance(m, Rows)
-            }
+            {name: method.for_exposure(self.spans, number) for name, method in shutters.items()}
         )
 
     def merge_chain(self, images: Sequence[Floats]) -> Chain:

@@ -137,10 +137,7 @@ def toml_text(chain: Chain) -> str:
     ]
     for step in chain.steps:
         lines += ["", f"[{step.name}]", *_step_lines(step, settings, draws)]
-    for name, table in _other_tables(chain, draws).items():
-        if table:
-            lines += ["", f"[{name}]", *(f"{k} = {value_text(v)}" for k, v in table.items())]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_table_lines(_other_tables(chain, draws))]) + "\n"
 
 
 def config_text(values: Mapping[str, Any], stage_files: Sequence[Path] = ()) -> str:
@@ -159,13 +156,19 @@ def config_text(values: Mapping[str, Any], stage_files: Sequence[Path] = ()) -> 
     """
     values = resolve_paths(Path.cwd(), values)
     code = {CODE: [str(file.resolve()) for file in stage_files]} if stage_files else {}
-    is_table = {key: isinstance(v, Mapping) and key not in KEYS for key, v in values.items()}
-    plain = {key: value for key, value in values.items() if not is_table[key]}
+    tables = {k: v for k, v in values.items() if isinstance(v, Mapping) and k not in KEYS}
+    plain = {key: value for key, value in values.items() if key not in tables}
     lines = [f"{key} = {value_text(value)}" for key, value in (code | plain).items()]
-    for name, table in values.items():
-        if is_table[name] and table:
+    return "\n".join([*lines, *_table_lines(tables)]) + "\n"
+
+
+def _table_lines(tables: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the lines of tables that are not empty."""
+    lines: list[str] = []
+    for name, table in tables.items():
+        if table:
             lines += ["", f"[{name}]", *(f"{k} = {value_text(v)}" for k, v in table.items())]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _step_lines(step: Step, settings: Settings, draws: Mapping[str, Any]) -> list[str]:

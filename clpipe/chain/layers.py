@@ -10,6 +10,7 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain, cached_by_structure
+from clpipe.chain.registry import all_stages
 from clpipe.images.kinds import flow_vectors
 from clpipe.reference.carried import Layer, warp
 from clpipe.stage import ImageLayer, LayerMethod
@@ -24,6 +25,14 @@ ARRAYS = {
 def layer_steps(chain: Chain) -> dict[str, LayerMethod]:
     """Return the methods of the steps that read a layer, by step name."""
     return {s.name: s.method for s in chain.steps if isinstance(s.method, LayerMethod)}
+
+
+def reader_of(kind: str) -> str:
+    """Return a setting that makes a chain read a layer of a kind, such as depth."""
+    methods = ((stage, method) for stage in all_stages().values() for method in stage.methods)
+    readers = ((s, m) for s, m in methods if issubclass(m, LayerMethod) and m.layer_kind == kind)
+    stage, method = next(readers)
+    return f"{stage.name}.method={method.method}"
 
 
 @cached_by_structure

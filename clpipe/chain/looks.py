@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from clpipe.base.errors import KeyedError
-from clpipe.chain.keys import KEYS, NOISE, TABLES, string_list
+from clpipe.chain.keys import KEYS, NOISE, TABLES, setting_error, string_list
 from clpipe.chain.methods import stage_named, step_names_of
 from clpipe.chain.settings import Settings, overlay
 from clpipe.stage import Kind
@@ -52,10 +51,9 @@ def first_after_raw(stages: Sequence[str]) -> int:
     """
     makers = [n for n, name in enumerate(stages) if stage_named("stages", name).writes is Kind.RAW]
     if not makers:
-        raise KeyedError(
-            "stages",
+        raise setting_error(
             f"stages: found {', '.join(stages)}, but none of these stages produces a raw. To "
-            "combine this development with another configuration's raw, add quantize",
+            "combine this development with another configuration's raw, add quantize"
         )
     return makers[-1] + 1
 
@@ -68,12 +66,7 @@ def _raw_settings(settings: Settings, raw: Sequence[str], stages: tuple[str, ...
     validated = {step: table for step, table in settings.validated.items() if step in names}
     draws = {k: draw for k, draw in settings.draws.items() if k.rpartition(".")[0] in names}
     return replace(
-        settings,
-        stages=stages,
-        skip=skip,
-        parameters=parameters,
-        validated=validated,
-        draws=draws,
+        settings, stages=stages, skip=skip, parameters=parameters, validated=validated, draws=draws
     )
 
 

@@ -13,20 +13,12 @@ from clpipe.chain.chain import Chain, Step
 from clpipe.chain.exposures import check_exposures
 from clpipe.chain.families import chain_of_family
 from clpipe.chain.isos import check_cameras
-from clpipe.chain.keys import LENS, NOISE, RENDER
+from clpipe.chain.keys import LENS, NOISE, RENDER, setting_error
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, stage_in, user_code_errors
 from clpipe.chain.settings import Settings
 from clpipe.reference.geometry import Scaling
-from clpipe.stage import (
-    Context,
-    Kind,
-    LensMethod,
-    Method,
-    Stage,
-    StageRole,
-    Unchanged,
-)
+from clpipe.stage import Context, Kind, LensMethod, Method, Stage, StageRole, Unchanged
 from clpipe.stages.projection import WideAngle
 
 
@@ -67,11 +59,7 @@ def make_chain(
 
 
 def _build_chain(
-    settings: Settings,
-    camera: Camera,
-    source: Kind | None,
-    start_at: str | None,
-    until: str | None,
+    settings: Settings, camera: Camera, source: Kind | None, start_at: str | None, until: str | None
 ) -> Chain:
     """Return the chain of settings without draws, see :func:`make_chain`."""
     steps = resolve_steps(settings, camera, source or (None if start_at else entry_kind(settings)))
@@ -79,14 +67,11 @@ def _build_chain(
     for name in settings.parameters:
         if name not in names and name not in all_stages():
             raise KeyedError(name, unknown_name("stage in this chain", name, names))
-    first, last = 0, len(steps)
-    for name in (n for n in (start_at, until) if n is not None):
-        if name not in names:
-            raise RequestError(unknown_name("stage in this chain", name, names))
-    if start_at is not None:
-        first = names.index(start_at)
-    if until is not None:
-        last = names.index(until) + 1
+    for end in (start_at, until):
+        if end not in (None, *names):
+            raise RequestError(unknown_name("stage in this chain", str(end), names))
+    first = names.index(start_at) if start_at else 0
+    last = names.index(until) + 1 if until else len(steps)
     if first >= last:
         raise RequestError(
             f"no stage is left to run, because {start_at} comes after {until}; exchange --start-at "
@@ -174,7 +159,7 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
         context = after
         kind, previous = stage.writes, name
     if not takes_lens:
-        raise KeyedError("lens", _unused_lens(settings, methods))
+        raise setting_error(_unused_lens(settings, methods))
     _check_pixels(steps)
     return steps
 
@@ -225,10 +210,9 @@ def _check_lens_name(name: str) -> None:
             issubclass(m, LensMethod) for m in stage.methods
         )
         if models and any(each.method == model for each in stage.methods):
-            raise KeyedError(
-                "lens",
+            raise setting_error(
                 f"lens: '{one_line(name)}' is a model, not the name of a lens such as 'Canon EF "
-                f"50mm f/1.8'; remove lens, and set {stage.name}.method={model} and its parameters",
+                f"50mm f/1.8'; remove lens, and set {stage.name}.method={model} and its parameters"
             )
 
 
@@ -248,10 +232,9 @@ def _check_after_wide(wide: str, name: str, method: Method) -> None:
         RequestError: the step needs a picture in perspective.
     """
     if isinstance(method, LensMethod):
-        raise KeyedError(
-            "lens",
+        raise setting_error(
             f"lens: a lens from lensfun needs a picture in perspective, but {wide} already "
-            f"applies a wide lens; remove lens, or skip {wide}",
+            f"applies a wide lens; remove lens, or skip {wide}"
         )
     if "fx" in type(method).model_fields:
         raise KeyedError(
@@ -273,11 +256,10 @@ def _check_curve(chain: Chain) -> None:
         is_levels = step.stage.role is StageRole.LEVELS and not step.context.knots
         if maker and is_levels and getattr(step.method, "knots", None):
             raw = maker.name
-            raise KeyedError(
-                f"{step.name}.knots",
+            raise setting_error(
                 f"{step.name}.knots: found knots, but {raw}.method={maker.method.method} "
                 f"applies no curve; set {raw}.method=pwl and {raw}.knots, and remove "
-                f"{step.name}.knots",
+                f"{step.name}.knots"
             )
         maker = step if step.stage.writes is Kind.RAW else maker
 
@@ -295,11 +277,10 @@ def _check_pixels(steps: list[Step]) -> None:
     for step in steps[steps.index(scaled) + 1 :]:
         stated = next((each for each in IN_PIXELS if getattr(step.method, each, None)), None)
         if stated and step.passes:
-            raise KeyedError(
-                f"{step.name}.{stated}",
+            raise setting_error(
                 f"{step.name}.{stated}: found {getattr(step.method, stated):g} px, measured in "
                 f"the render, but the earlier stage {scaled.name} changes the size of pixels; "
-                f"list {step.name} before {scaled.name}",
+                f"list {step.name} before {scaled.name}"
             )
 
 

@@ -12,7 +12,7 @@ from clpipe.base.errors import KeyedError
 from clpipe.base.text import unknown_name
 from clpipe.base.validation import first_fault
 from clpipe.camera.control import Control
-from clpipe.chain.keys import CONTROL, NOISE, OUTPUT, RENDER
+from clpipe.chain.keys import CONTROL, NOISE, OUTPUT, RENDER, setting_error
 from clpipe.chain.registry import all_stages
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.encoding import Encoding
@@ -149,7 +149,7 @@ def method_named(stage: Stage, name: str, chosen: Any) -> type[Method]:
     """
     if not isinstance(chosen, str) or chosen not in stage.by_name:
         message = unknown_name("method", str(chosen), stage.by_name)
-        raise KeyedError(f"{name}.method", f"{name}.method: {message}")
+        raise setting_error(f"{name}.method: {message}")
     return stage.by_name[chosen]
 
 

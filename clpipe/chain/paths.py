@@ -5,8 +5,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.errors import KeyedError, RequestError
+from clpipe.base.errors import RequestError
 from clpipe.base.url_text import local
+from clpipe.chain.keys import setting_error
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.stage import Stage
@@ -50,7 +51,7 @@ def _joined(folder: Path | None, key: str, value: Any, only: str = "") -> Any:
     try:
         return join_path(folder, value, only)
     except RequestError as error:
-        raise KeyedError(key, f"{key}: {error}") from None
+        raise setting_error(f"{key}: {error}") from None
 
 
 def join_path(folder: Path | None, value: Any, only: str = "") -> Any:

@@ -3,7 +3,7 @@
 import os
 import re
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -14,7 +14,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from threading import RLock
 from types import ModuleType
-from typing import Never
+from typing import Any, Never
 
 import numpy as np
 from pydantic import ValidationError
@@ -58,9 +58,8 @@ def installed_stages() -> dict[str, Stage]:
     stages: dict[str, Stage] = {}
     for entry in entry_points(group=ENTRY_POINTS):
         package = f"package {entry.dist.name}" if entry.dist else f"entry point {entry.name}"
-        stage, file = _load_stage(package, entry)
-        _check_stage_name(package, stage.name, built_in_stages() | stages)
-        stages[stage.name] = replace(stage, folder=file.parent)
+        stage = _load_stage(package, entry, built_in_stages() | stages)
+        stages[stage.name] = stage
     return stages
 
 
@@ -122,19 +121,19 @@ def _load_file(path: Path, real_path: Path) -> Stage:
             check_regular(real_path)
         except OSError as error:
             raise RequestError(f"{path}: cannot read the stage file: {error.strerror}") from None
-        module = module_from_spec(spec)
-        stage, _ = _load_stage(str(path), module)
-        _check_stage_name(str(path), stage.name, all_stages())
-        _from_files[real_path] = replace(stage, folder=real_path.parent)
+        _from_files[real_path] = _load_stage(str(path), module_from_spec(spec), all_stages())
     return _from_files[real_path]
 
 
-def _load_stage(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Path]:
-    """Return the stage of an entry point, or of a module that this function runs, and its file.
+def _load_stage(
+    place: str, source: EntryPoint | ModuleType, existing: Mapping[str, Stage]
+) -> Stage:
+    """Return the stage of an entry point, or of a module that this function runs.
 
     Args:
         place: the package or the file, for messages.
         source: the entry point or the module.
+        existing: the stages whose names it must not have.
 
     Raises:
         RequestError: the stage cannot be loaded, or is not valid.
@@ -149,27 +148,36 @@ def _load_stage(place: str, source: EntryPoint | ModuleType) -> tuple[Stage, Pat
             assert module.__spec__ and module.__spec__.loader
             module.__spec__.loader.exec_module(module)
             stage = getattr(module, "STAGE", None)
+    home = Path(str(module.__file__)).parent
+    for problem in _problems(stage, home, existing):
+        raise RequestError(f"{place}: {problem}")
+    return replace(stage, folder=home)
+
+
+def _problems(stage: Any, folder: Path, existing: Mapping[str, Stage]) -> Iterator[str]:
+    """Yield what is wrong with a user's stage, whose kernels are in a folder."""
     if not isinstance(stage, Stage):
-        raise RequestError(
-            f"{place}: STAGE is missing or is not a clpipe.stage.Stage; define STAGE = Stage(...)"
-        )
-    file = Path(str(module.__file__))
+        yield "STAGE is missing or is not a clpipe.stage.Stage; define STAGE = Stage(...)"
     if not isinstance(stage.methods, tuple) or not stage.methods:
-        raise RequestError(f"{place}: the methods of {stage.name} must be a tuple: (Method,)")
+        yield f"the methods of {stage.name} must be a tuple: (Method,)"
     for method in stage.methods:
         if not (isinstance(method, type) and issubclass(method, Method)):
-            raise RequestError(
-                f"{place}: {method!r} is not derived from Method; list subclasses of Method only"
-            )
-        missing = [n for n in ("method", "kernel", "summary") if not hasattr(method, n)]
-        if missing:
-            raise RequestError(
-                f"{place}: {method.__name__} lacks {', '.join(missing)}; define this in the class"
-            )
-        kernel = file.parent / f"{method.kernel}.cl"
+            yield f"{method!r} is not derived from Method; list subclasses of Method only"
+        if missing := [n for n in ("method", "kernel", "summary") if not hasattr(method, n)]:
+            yield f"{method.__name__} lacks {', '.join(missing)}; define this in the class"
+        kernel = folder / f"{method.kernel}.cl"
         if method.kernel and not kernel.is_file():
-            raise RequestError(f"{place}: its kernel {kernel} does not exist; create this file")
-    return stage, file
+            yield f"its kernel {kernel} does not exist; create this file"
+    name, reason = stage.name, ""
+    if not name.isidentifier() or name[-1].isdecimal():
+        reason = "a name has only letters, digits and _, and does not end in a digit"
+    elif name == NOISE:
+        reason = "--skip uses this name for all noise"
+    elif name in existing:
+        owner = existing[name].folder or "clpipe itself"
+        reason = f"another stage has this name ({owner})"
+    if reason:
+        yield f"its stage is called '{name}', but {reason}; choose another name"
 
 
 @contextmanager
@@ -229,22 +237,3 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
                     f"stage {name}: arguments() returns {value!r} as '{argument}'; its type must "
                     f"be one of {allowed}"
                 )
-
-
-def _check_stage_name(place: str, name: str, existing: dict[str, Stage]) -> None:
-    if not name.isidentifier() or name[-1].isdecimal():
-        raise RequestError(
-            f"{place}: its stage is called '{name}', but a name has only letters, digits and _, "
-            "and does not end in a digit; choose another name"
-        )
-    if name == NOISE:
-        raise RequestError(
-            f"{place}: its stage is called '{name}', but --skip uses this name for all noise; "
-            "choose another name"
-        )
-    if name in existing:
-        owner = existing[name].folder or "clpipe itself"
-        raise RequestError(
-            f"{place}: its stage is called '{name}', but another stage has this name "
-            f"({owner}); choose another name"
-        )

@@ -186,9 +186,8 @@ class Request(RecordedRequest):
         keep = chain.select(self.keep)
         mosaic_step = noisy_mosaic(chain).steps[-1].name if MOSAIC in self.truths else ""
         truth_keep = tuple(step for step in keep if step != mosaic_step)
-        known = {each.name: getattr(self, each.name) for each in fields(Request)}
-        known |= {"formats": formats, "keep": keep, "truth_keep": truth_keep}
-        return ResolvedRequest(**known)
+        outputs = {"formats": formats, "keep": keep, "truth_keep": truth_keep}
+        return ResolvedRequest(**{**vars(self), **outputs})
 
     def aov_specs(self) -> tuple[AovSpec, ...]:
         """Return the layers that are warped and written with each picture.

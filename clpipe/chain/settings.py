@@ -16,18 +16,19 @@ from clpipe.base.errors import KeyedError, RequestError
 from clpipe.base.text import quote_alternatives, unknown_name
 from clpipe.base.tracing import with_changes
 from clpipe.camera.control import Control
-from clpipe.camera.profile import DEFAULT_CAMERA, Camera, built_in_name, load_camera
+from clpipe.camera.profile import Camera, built_in_name, load_camera
 from clpipe.chain.drawing import draw_extremes, draw_values, examples_of, parse_drawn
 from clpipe.chain.draws import Choice, Draw
 from clpipe.chain.keys import (
     CODE,
-    DEFAULT_ISO,
     KEYS,
     LENS,
     MAX_STAGES,
     TABLES,
+    PlainSettings,
     check_type,
     set_dotted,
+    setting_error,
     string_list,
 )
 from clpipe.chain.lens_presets import PRESETS, with_preset, without_preset
@@ -49,27 +50,15 @@ from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.dump import Dump, parse_dump
 from clpipe.images.encoding import Encoding
 from clpipe.stage import Method
-from clpipe.stages import DEFAULT_CHAIN
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(PlainSettings):
     """Values that can be set. Nothing is resolved yet: None and missing values are automatic.
 
     The values in ``draws``, by dotted name ("sensor_noise.a"), are drawn by :meth:`drawn`.
     """
 
-    camera: str = DEFAULT_CAMERA
-    iso: float = DEFAULT_ISO
-    lens: str = ""  # a name in lensfun's database, or of a preset
-    focal_length: float | None = None  # mm
-    aperture: float | None = None  # f-number
-    focus_distance: float | None = None  # m
-    seed: int = 0
-    noise_key: str = ""  # "": derived from the image and the ISO
-    dump: str = ""  # format of headerless dumps, WIDTHxHEIGHT:TYPE
-    stages: tuple[str, ...] = DEFAULT_CHAIN
-    skip: tuple[str, ...] = ()
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     output: Encoding = field(default_factory=Encoding)
     render: RenderCamera = field(default_factory=RenderCamera)
@@ -327,13 +316,12 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
             entry = (
                 f"'method': {value!r}" if key in all_stages() and isinstance(value, str) else "..."
             )
-            raise KeyedError(
-                key,
+            raise setting_error(
                 f"{key}: found {value!r}, but it is a table; in Python use {key}={{{entry}}}, in a "
-                f"file [{key}]",
+                f"file [{key}]"
             )
         if key == CODE:
-            raise KeyedError(key, f"{key}: set it in a configuration file, or use --stage-file")
+            raise setting_error(f"{key}: set it in a configuration file, or use --stage-file")
         if key not in KEYS:
             similar = [each for each in parameter_names() if each.endswith(f".{key}")]
             hint = f"; did you mean {quote_alternatives(similar)}?" if similar else ""
@@ -343,9 +331,7 @@ def _check_plain_values(settings: Settings, plain: Mapping[str, Any]) -> dict[st
         if key in plain:
             names = string_list(plain, key, "stage names")
             if key == "stages" and len(names) > MAX_STAGES:
-                raise KeyedError(
-                    key, f"{key}: found {len(names)} stages; list at most {MAX_STAGES}"
-                )
+                raise setting_error(f"{key}: found {len(names)} stages; list at most {MAX_STAGES}")
             for name in names:
                 check_step(key, name)
             checked[key] = (*settings.skip, *names) if key == "skip" else names

@@ -1,6 +1,6 @@
 """``clpipe cameras``: list cameras, show the noise of one, or import a noise model."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,50 +18,30 @@ from clpipe.commands.completion import cameras_or_import
 from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
 
-# Fields of a profile that are the same at every ISO, with units. Every sensor has these.
-COMMON = {
-    "name": "",
+# The units of the fields of a profile, if they have one.
+UNITS = {
+    **dict.fromkeys(("black_level", "white_level", "dark_shading_offset"), "DN"),
+    **dict.fromkeys(("full_well", "dsnu", "hot_pixel_level", "rts_amplitude"), "e-"),
+    "banding_amplitude": "e-",
     "iso_range": "ISO",
-    "black_level": "DN",
-    "white_level": "DN",
-    "bits": "",
     "white_balance_gains": "red, blue",
     "quantum_efficiency": "e-/photon",
-    "full_well": "e-",
     "pixel_pitch": "um",
-    "tukey_lambda": "",
-    "prnu": "",
-    "crosstalk": "",
-    "dsnu": "e-",
-    "hot_pixel_share": "",
-    "hot_pixel_level": "e-",
-    "dead_pixel_share": "",
-    "rts_share": "",
-    "rts_amplitude": "e-",
     "dark_current": "e-/s",
     "dark_current_temperature": "deg C",
     "dark_current_doubling": "K",
-    "dark_current_spread": "",
     "dark_shading_slope": "DN/ISO",
-    "dark_shading_offset": "DN",
     "dark_shading_length": "px",
-    "banding_amplitude": "e-",
     "banding_period": "rows",
     "xyz_to_camera": "XYZ to camera RGB",
 }
 # Fields that only some sensors have. A profile without them has no unknown values.
-SPECIAL = {
-    "aliases": "",
-    "filter_array": "",
-    "row_noise_ratio": "",
-    "column_noise_ratio": "",
-    "readout_ratio": "",
-    "readout_noise": "",
-    "photodiode_ratio": "",
-    "photodiode_crosstalk": "",
-}
-FIXED = {**COMMON, **SPECIAL}
-DERIVED = ("bits",)  # the fields of FIXED that are computed from others
+SPECIAL: tuple[str, ...] = ("aliases", "filter_array", "row_noise_ratio", "column_noise_ratio")
+SPECIAL += ("readout_ratio", "readout_noise", "photodiode_ratio", "photodiode_crosstalk")
+DERIVED = ("bits",)  # computed from other fields
+# The fields that are the same at every ISO.
+OTHERS = ("make", "model", "gain_stages", "sources")
+FIXED = tuple(name for name in (*Camera.model_fields, *DERIVED) if name not in OTHERS)
 UNKNOWN = "unknown"
 
 
@@ -183,34 +163,25 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
     Raises:
         RequestError: the ISO is outside the camera's range.
     """
-    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     signal: Rows = []
     paper: Rows = []
-    for i in isos:
-        record = noise_at(camera, i)
-        lines = record["dark_noise"], record["row_noise"], record["column_noise"]
+    dark: Rows = []
+    for record in records_at(camera, iso):
+        i, names = record["iso"], ("dark_noise", "row_noise", "column_noise")
+        lines = (record[name] for name in names)
         signal.append(figures(i, *record["signal"].values(), *record["emva1288"].values(), *lines))
         paper.append(figures(i, *record["paper"].values()))
+        dark.append(dark_frames_row(camera, record))
     return [
         (
             f"{make_and_model(camera)}: Var[y] = a*y + b, y = 1 at the white level; EMVA 1288",
-            (
-                "ISO",
-                "a",
-                "b",
-                "system_gain",
-                "read_noise",
-                "adc_noise",
-                "both",
-                "row",
-                "column",
-            ),
+            ("ISO", "a", "b", "system_gain", "read_noise", "adc_noise", "both", "row", "column"),
             [("", "", "", "DN/e-", "e-", "DN", "DN", "DN", "DN"), *signal],
         ),
         (
             "Dark frames: shape of the read noise, errors of the black level",
             ("ISO", "tukey_lambda", "color_bias: R, G, G, B", "black_level_error"),
-            [("", "", "DN", "DN"), *(dark_frames_row(camera, i) for i in isos)],
+            [("", "", "DN", "DN"), *dark],
         ),
         (
             "The paper's form: a = theta/chi, b = theta^2 b' + b'' - theta^2 p0/chi",
@@ -221,8 +192,9 @@ def camera_tables(camera: Camera, iso: float | None) -> list[tuple[str, tuple[st
             "At every ISO",
             ("", "value", "unit"),
             [
-                (key, known_text(camera, key).replace("], [", "],\n["), unit)  # a row per line
-                for key, unit in FIXED.items()
+                # A matrix has a row per line.
+                (key, known_text(camera, key).replace("], [", "],\n["), UNITS.get(key, ""))
+                for key in FIXED
                 if key not in SPECIAL or key in camera.model_fields_set
             ],
         ),
@@ -240,16 +212,15 @@ def known_text(camera: Camera, key: str) -> str:
     return short_text(value) if is_known and value is not None else UNKNOWN
 
 
-def dark_frames_row(camera: Camera, iso: float) -> tuple[str, ...]:
+def dark_frames_row(camera: Camera, record: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the row of one ISO with values of dark frames other than their noise."""
-    stage, unit = camera.gain_stage(iso), camera.signal_range
-    shape = camera.tukey_lambda_at(iso)
-    bias = ", ".join(f"{offset * unit:.3g}" for offset in camera.color_bias(iso))
+    iso, shape = record["iso"], record["tukey_lambda"]
+    stage = camera.gain_stage(iso)
     return (
         f"{iso:g}",
         UNKNOWN if shape is None else f"{shape:.3g}",
-        bias if stage.color_bias else UNKNOWN,
-        f"{camera.black_level_error(iso) * unit:.3g}" if stage.black_level_error else UNKNOWN,
+        ", ".join(f"{x:.3g}" for x in record["color_bias"]) if stage.color_bias else UNKNOWN,
+        f"{record['black_level_error']:.3g}" if stage.black_level_error else UNKNOWN,
     )
 
 
@@ -278,20 +249,23 @@ def noise_at(camera: Camera, iso: float) -> dict[str, Any]:
     }
 
 
+def records_at(camera: Camera, iso: float | None) -> list[dict[str, Any]]:
+    """Return the noise at an ISO, or at all measured ISOs, see :func:`noise_at`."""
+    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
+    return [noise_at(camera, i) for i in isos]
+
+
 def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
     """Return a camera as JSON values, with its noise at an ISO or at all measured ISOs.
 
     Raises:
         RequestError: the ISO is outside the camera's range.
     """
-    isos = [iso] if iso is not None else [i for stage in camera.gain_stages for i in stage.iso]
     return {
         "make": camera.make,
         "model": camera.model,
         **{key: getattr(camera, key) for key in FIXED},
-        "unknown": [
-            key for key in FIXED if key not in SPECIAL and known_text(camera, key) == UNKNOWN
-        ],
-        "noise": [noise_at(camera, i) for i in isos],
+        "unknown": [k for k in FIXED if k not in SPECIAL and known_text(camera, k) == UNKNOWN],
+        "noise": records_at(camera, iso),
         "sources": camera.sources,
     }

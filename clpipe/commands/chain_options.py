@@ -1,10 +1,11 @@
 """Command-line options for the keys of a configuration and of a run.
 
-:mod:`clpipe.chain.keys` and :mod:`clpipe.chain.options` define the names, types, ranges, choices
-and texts.
+:mod:`clpipe.chain.keys` and :mod:`clpipe.chain.options` define the names, types, ranges and
+choices. The docstring of :func:`clpipe.run` describes the options of a run.
 """
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -14,12 +15,13 @@ from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import whole_number
 from clpipe.chain.assignments import parse_assignment
-from clpipe.chain.formats import format_named
-from clpipe.chain.keys import CODE, KEYS, Key
-from clpipe.chain.options import DEVICE, OPTIONS
+from clpipe.chain.formats import ALL_FORMATS, format_named
+from clpipe.chain.keys import CODE, KEYS, Key, arguments_in
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.request import Request
 from clpipe.commands.completion import COMPLETIONS, parameters
-from clpipe.commands.options import EXISTING, F, output_option
+from clpipe.commands.docstrings import docstring_of
+from clpipe.commands.options import EXISTING, F, Option, output_option
 
 
 class FormatName(click.Choice[str]):
@@ -52,6 +54,22 @@ def patch_count(text: str) -> int | str:
     return text if text == "grid" else count
 
 
+ARGUMENTS = arguments_in(docstring_of("batch.api", "run"))
+
+
+def described(key: Key) -> Key:
+    """Return the key of an option with its text and default in the docstring of ``clpipe.run``.
+
+    >>> described(OPTIONS["bit_rate"]).text
+    'The mean bit rate of clips in bits per second, such as 8M, instead of --crf.'
+    """
+    entry = ARGUMENTS.get(key.name, "")  # without docstrings (python -OO), settings have no text
+    words = re.sub(r"``(\w+)``", lambda match: f"--{match[1].replace('_', '-')}", entry)
+    described, _, default = words.partition(" None is ")
+    text, _, _ = described.partition(" The choices are ")
+    return key._replace(text=text, default_text=default.removesuffix("."))
+
+
 # Keys whose options are not called --name, and keys whose options have special types.
 FLAGS = {"config": ("-c", "--config"), CODE: ("--stage-file",)}
 TYPES: dict[str, Any] = {
@@ -71,6 +89,7 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
         parameter: the parameter of the command's function, if it is not the key's name.
         **others: arguments of :func:`click.option` that replace those from the key.
     """
+    key = key if key.text else described(key)
     type_: Any = {int: int, float: float}.get(key.type_)
     if key.choices:
         choice = FormatName if key.name == "format" else click.Choice
@@ -80,10 +99,12 @@ def option(key: Key, parameter: str = "", **others: Any) -> Callable[[F], F]:
     multiple = key.type_ is list and key.name != "stages"
     texts = [key.text, f"In {key.unit}." * bool(key.unit), "May be repeated." * multiple]
     attributes: dict[str, Any] = {
+        "cls": Option,
+        "heading": key.heading,
         "type": TYPES.get(key.name, type_),
         "metavar": key.metavar,
         "multiple": multiple,
-        "shell_complete": COMPLETIONS.get(key.name),
+        "shell_complete": COMPLETIONS.get(key.name) or COMPLETIONS.get(key.metavar or ""),
         "help": " ".join(
             filter(None, [*texts, f"[default: {key.default_text}]" * bool(key.default_text)])
         ),
@@ -112,14 +133,20 @@ def options(*keys: Key | str) -> Callable[[F], F]:
 set_option = click.option(
     "--set",
     "assignments",
+    cls=Option,
+    heading="+Chain",
     multiple=True,
     metavar="STAGE.PARAM=VALUE",
     shell_complete=parameters,
     help="Set a parameter. STAGE.method=NAME chooses a method. A value such as '{uniform=[1, 2]}' "
     "is drawn for each image. May be repeated.",
 )
-out_option = output_option("OUT", OPTIONS["output"].text)
-device_option = option(DEVICE, "selector")
+out_option = output_option("OUT", described(OPTIONS["output"]).text)
+DEVICE = described(OPTIONS["device"])._replace(type_=str)
+device_option = option(DEVICE._replace(default_text="the first GPU, else the CPU"), "selector")
+FORMAT = described(OPTIONS["format"])._replace(choices=ALL_FORMATS)
+# A sentence about clips follows, which only clpipe run writes.
+format_option = option(FORMAT._replace(text=FORMAT.text.partition(" mp4 and")[0]), "formats")
 
 # Settings with an option, in addition to the camera and the ISO.
 SETTINGS = tuple(key for name, key in KEYS.items() if name not in ("camera", "iso", "dump", CODE))

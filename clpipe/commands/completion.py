@@ -103,13 +103,11 @@ def _file(text: str) -> list[CompletionItem]:
     return [CompletionItem(text, type="file")]
 
 
-# Completion functions by option.
+# Completion functions by option, or by what the help writes in place of an option's value.
 COMPLETIONS = {
     "camera": cameras,
     "config": configs,
-    "stages": stage_lists,
-    "skip": steps,
-    "start_at": steps,
-    "until": steps,
-    "keep": steps_or_all,
+    "A,B,C": stage_lists,
+    "STAGE": steps,
+    "STAGE|all": steps_or_all,
 }

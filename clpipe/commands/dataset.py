@@ -18,13 +18,15 @@ from clpipe.batch.images import Images
 from clpipe.batch.run_log import Summary
 from clpipe.batch.session import Run
 from clpipe.chain.keys import CODE
-from clpipe.chain.options import FORMAT, TRUTH
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
+from clpipe.chain.rendition import CLEAN, TRUTHS
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import (
     SETTINGS,
     device_option,
+    format_option,
     option,
     options,
     set_option,
@@ -34,6 +36,7 @@ from clpipe.commands.options import (
     EXISTING,
     ExistingPath,
     GroupedCommand,
+    Option,
     json_lines_option,
     options_on_command_line,
     output_option,
@@ -48,15 +51,7 @@ from clpipe.reference.wide import MODELS
 from clpipe.scenes.blender import Rendering
 from clpipe.scenes.card import CardContents, write_card
 from clpipe.scenes.record import store_credits
-from clpipe.scenes.source import (
-    NOTE,
-    RENDERS,
-    UNIT,
-    Source,
-    from_folder,
-    from_leaves,
-    from_scene,
-)
+from clpipe.scenes.source import NOTE, RENDERS, UNIT, Source, from_folder, from_leaves, from_scene
 from clpipe.scenes.view_request import (
     DEFAULT_VIEWS,
     PATHS,
@@ -73,6 +68,8 @@ RENDER_OPTIONS = (*VIEW_OPTIONS, "resolution", "samples", "denoise", "time_limit
 
 LEAVES = "leaves"  # the source that needs no renderer
 LEAVES_OPTIONS = ("views", "resolution", "palette")
+
+render_option = partial(click.option, cls=Option, heading="Renders")
 
 
 class SourcePath(ExistingPath):
@@ -92,81 +89,105 @@ class SourcePath(ExistingPath):
 @click.command("dataset", cls=GroupedCommand)
 @click.argument("source", type=SourcePath(path_type=Path), metavar="SCENE.blend|FOLDER|leaves")
 @output_option("DS", "The directory of the dataset. It is created if it does not exist.")
-@click.option(
+@render_option(
     "--views",
+    heading="+Renders",
     type=click.IntRange(1, 100_000),
     metavar="N",
     help="Render N views around the point that the scene's camera looks at, or make N dead leaves "
     "images. [default: 24]",
 )
-@click.option(
+@render_option(
     "--path",
+    heading="+Renders",
     type=click.Choice(PATHS),
     help="The positions of views: a full circle (orbit), 60 degrees around the scene's camera "
     "(arc), or random positions in a box around it (random). [default: orbit]",
 )
-@click.option(
+@render_option(
     "--box",
     metavar="X,Y,Z,X,Y,Z",
     type=parse_box,
     help="Two corners of the box of --path random. [default: half as wide as the distance from the "
     "camera to the point that it looks at]",
 )
-@click.option(
+@render_option(
     "--frames",
+    heading="+Renders",
     metavar="A-B",
     type=parse_frames,
     help="Render these frames of the scene, with the scene's camera, such as 1-24 or 1,5,9.",
 )
-@click.option(
+@render_option(
     "--resolution",
+    heading="+Renders",
     metavar="WxH",
     type=parse_resolution,
     help="The resolution of the renders in px. [default: the scene's; 512x512 for leaves]",
 )
-@click.option(
-    "--palette",
-    type=EXISTING,
-    metavar="IMAGE",
-    help="A render or photograph whose colours dead leaves have. [default: drawn colours]",
-)
-@click.option(
+@render_option(
     "--samples",
+    heading="+Renders",
     default=128,
     show_default=True,
     type=click.IntRange(1, 2**24),
     help="The number of light paths per pixel.",
 )
-@click.option(
+@render_option(
     "--denoise/--no-denoise",
     default=True,
     show_default=True,
     help="Have Blender remove the noise of its light paths, which is not camera noise.",
 )
-@click.option(
+@render_option(
     "--time-limit",
     type=click.FloatRange(0, min_open=True),
     metavar="SECONDS",
     help="Stop rendering a view after this time. The result then depends on the machine.",
 )
-@click.option(
+@render_option(
     "--blender",
     metavar="PATH",
     help="An installed Blender, 4.2 or newer, or a Python with the package bpy. [default: this "
     "Python]",
 )
-@options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE, "carry", "poses")
+@render_option(
+    "--palette",
+    type=EXISTING,
+    metavar="IMAGE",
+    help="A render or photograph whose colours dead leaves have. [default: drawn colours]",
+)
 @set_option
-@option(TRUTH, default=(TRUTH.default_text,))
-@option(FORMAT, "formats")
+@options("config", "camera", "iso", *SETTINGS, "start_at", "until", CODE)
+@option(
+    OPTIONS["truth"]._replace(
+        text="Write the picture without noise (development), without noise and denoising (clean), "
+        "the clean mosaic (mosaic), or its noise variance (variance).",
+        default_text=CLEAN,
+        choices=TRUTHS,
+    ),
+    default=(CLEAN,),
+)
+@options("carry", "poses")
+@format_option
 @click.option(
     "--licence",
+    cls=Option,
+    heading="Pictures",
     metavar="TEXT",
     help="The licence of the dataset, for its README, such as CC-BY-4.0 or a sentence.",
 )
-@click.option("--author", metavar="TEXT", help="The author of the dataset, for its README.")
+@click.option(
+    "--author",
+    cls=Option,
+    heading="Pictures",
+    metavar="TEXT",
+    help="The author of the dataset, for its README.",
+)
 @click.option(
     "--lens-model",
+    cls=Option,
+    heading="Camera",
     type=click.Choice(sorted(MODELS)),
     help="Render the faces of a cube, and combine them into the picture of a wide lens of this "
     "model. Set its coefficients with --set projection.fx=300 and so on.",

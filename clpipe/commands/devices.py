@@ -14,6 +14,8 @@ from clpipe.engine.discovery import DeviceInfo, choose, find_devices
 from clpipe.engine.programs import CacheState, cache_state
 from clpipe.engine.vendors import unloadable_drivers
 
+FIELDS = ("index", "name", "platform", "driver", "type", "compute_units", "memory", "lanes")
+
 
 @click.command("devices", cls=Command)
 @json_option
@@ -66,28 +68,10 @@ def device_rows(devices: Sequence[DeviceInfo]) -> list[dict[str, Any]]:
             status = f"not used: there is a GPU; use it with --device {device.index}"
         else:
             status = f"not used: another device is first; use it with --device {device.index}"
-        rows.append(
-            {
-                "index": device.index,
-                "name": device.name,
-                "platform": device.platform,
-                "driver": device.driver,
-                "type": device.type,
-                "compute_units": device.compute_units,
-                "memory": f"{device.memory / 2**30:.1f} GiB",
-                "lanes": device.lanes,
-                "target": device.target.name,
-                "target_reason": device.target.reason,
-                "status": status,
-            }
-        )
-    numpy = "slow; use it with --device numpy"
-    blank = dict.fromkeys(
-        ("driver", "compute_units", "memory", "lanes", "target", "target_reason"), ""
-    )
-    rows.append(
-        {"index": "numpy", "name": "NumPy", "platform": "the references", "type": "CPU"}
-        | blank
-        | {"status": numpy}
-    )
-    return rows
+        values = {name: getattr(device, name) for name in FIELDS}
+        target = {"target": device.target.name, "target_reason": device.target.reason}
+        memory = {"memory": f"{device.memory / 2**30:.1f} GiB"}
+        rows.append({**values, **memory, **target, "status": status})
+    blank = dict.fromkeys((*FIELDS, "target", "target_reason"), "")
+    numpy = {"index": "numpy", "name": "NumPy", "platform": "the references", "type": "CPU"}
+    return [*rows, {**blank, **numpy, "status": "slow; use it with --device numpy"}]

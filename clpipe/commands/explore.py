@@ -32,11 +32,7 @@ from clpipe.inputs.loader import ImageLoader
     "[default: a free port]",
 )
 def explore(
-    inputs: tuple[str, ...],
-    selector: str | None,
-    as_json: bool,
-    port: int | None,
-    **chosen: Any,
+    inputs: tuple[str, ...], selector: str | None, as_json: bool, port: int | None, **chosen: Any
 ) -> None:
     """Try a camera on renders, on a page in the browser that updates as you change settings.
 

@@ -1,6 +1,5 @@
 """The command ``clpipe``: a group of commands, each imported on first use."""
 
-import ast
 import gc
 import io
 import logging
@@ -9,7 +8,6 @@ import re
 import sys
 import traceback
 from importlib import import_module
-from pathlib import Path
 from typing import Any, NoReturn
 
 import click
@@ -21,6 +19,7 @@ from clpipe.base.interface import command_line
 from clpipe.base.memory import check_address_space
 from clpipe.base.system import max_address_space, processors, use_single_heap
 from clpipe.base.text import one_line, quote_alternatives, similar_names
+from clpipe.commands.docstrings import docstring_of
 from clpipe.commands.notices import NOTICES
 
 # Commands by heading of the help. Each is a module of this package that defines a function of its
@@ -161,9 +160,7 @@ def summary(name: str) -> str:
 
     Importing all commands would take ten times as long.
     """
-    module = ast.parse(Path(__file__).with_name(f"{name}.py").read_text("utf-8"))
-    functions = (node for node in module.body if isinstance(node, ast.FunctionDef))
-    text = next(ast.get_docstring(f) or "" for f in functions if f.name == name)
+    text = docstring_of(f"commands.{name}", name)
     return re.split(r"[.:](?=\s|$)", " ".join(text.split()))[0]
 
 

@@ -20,21 +20,16 @@ from clpipe.base.url_text import is_url, local, local_path
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# The options of commands with many options, by heading. --help lists the options marked "+"
-# briefly. --help-all describes all options in full.
-GROUPS = {
-    "Camera": "+config +camera +iso +lens lens_model focal_length aperture focus_distance +seed "
-    "noise_key",
-    "Chain": "+set +skip stages start_at until stage_file",
-    "Renders": "+views +path box +frames +resolution +samples denoise time_limit blender palette",
-    "Pictures": "+output +format +keep bracket +patch patches_per_image augment webdataset licence "
-    "author",
-    "Clips": "codec crf bit_rate bit_depth fps gaps decoded",
-    "Truth": "+truth +carry truth_at",
-    "Inputs": "+sequence +poses +annotations +exclude layer transfer dump max_pixels",
-    "Batches": "+device +redo jobs processes memory shard dask max_failures dry_run quiet "
-    "json_lines metrics trace +help +help_all",
-}
+# The headings in the help of commands with many options.
+HEADINGS = ("Camera", "Chain", "Renders", "Pictures", "Clips", "Truth", "Inputs", "Batches")
+
+
+class Option(click.Option):
+    """An option with one of the :data:`HEADINGS`; "+" marks what brief help also shows."""
+
+    def __init__(self, *arguments: Any, heading: str = "Batches", **others: Any) -> None:
+        super().__init__(*arguments, **others)
+        self.heading = heading
 
 
 class Command(click.Command):
@@ -125,22 +120,18 @@ class GroupedCommand(Command):
             ctx.exit()
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        for title, rows in self._groups(ctx):
-            with formatter.section(title):
-                formatter.write_dl(rows)
-
-    def _groups(self, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-        """Yield the headings and their rows."""
         show_all = ctx.meta.get(ALL, False)
-        records = {
-            option.opts[-1].lstrip("-").replace("-", "_"): record
-            for option in self.get_params(ctx)
-            if isinstance(option, click.Option) and (record := option.get_help_record(ctx))
-        }
-        for title, names in GROUPS.items():
-            shown = [n.lstrip("+") for n in names.split() if show_all or n[0] == "+"]
-            if rows := [records[name] for name in shown if name in records]:
-                yield title, rows if show_all else [(flags, brief(text)) for flags, text in rows]
+        groups: dict[str, list[tuple[str, str]]] = {title: [] for title in HEADINGS}
+        for option in self.get_params(ctx):
+            heading, record = getattr(option, "heading", "Batches"), option.get_help_record(ctx)
+            is_shown = show_all or heading.startswith("+") or option.is_eager
+            if record and is_shown and isinstance(option, click.Option):
+                text = record[1] if show_all else brief(record[1])
+                groups[heading.removeprefix("+")].append((record[0], text))
+        for title, rows in groups.items():
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
 
 def brief(text: str) -> str:
@@ -210,6 +201,8 @@ def output_option(
         "-o",
         "--output",
         "outputs" if multiple else "output",
+        cls=Option,
+        heading="+Pictures",
         required=required,
         multiple=multiple,
         type=OutputPath(path_type=Path),

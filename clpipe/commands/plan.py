@@ -8,8 +8,7 @@ import click
 from clpipe.base.errors import RequestError
 from clpipe.base.text import unknown_name
 from clpipe.chain.files import toml_text
-from clpipe.chain.options import FORMAT, OPTIONS
-from clpipe.commands.chain_options import chain_options, option, request_of
+from clpipe.commands.chain_options import chain_options, format_option, options, request_of
 from clpipe.commands.options import Command, json_option
 from clpipe.commands.printing import show, show_json
 from clpipe.engine.bands import BAND, schedule_of
@@ -27,8 +26,8 @@ CPU = Cpu(cores=2, cache=USUAL_CACHE)
 
 @click.command("plan", cls=Command)
 @chain_options
-@option(OPTIONS["keep"])
-@option(FORMAT, "formats")
+@options("keep")
+@format_option
 @json_option
 @click.option("--toml", "as_toml", is_flag=True, help="Print the chain as a configuration.")
 @click.option("--source", metavar="LAUNCH", help="Print the OpenCL source of a launch.")

@@ -7,7 +7,7 @@ import contextlib
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -193,38 +193,26 @@ class Reporter:
         images = "images" if self._several else "image"
         return "; ".join([f"{summary.made} of {summary.total} {images}", *parts])
 
-    def _clipping_warning(self) -> str:
-        """Return a warning about images with much clipping."""
-        share, path = self._summary.most_clipped
-        text = clipping_text(share)
-        if not self._several:
-            return f"clpipe: {path}: warning: {text}"
-        count = self._summary.much_clipped
-        images = "images have" if count > 1 else "image has"
-        return f"{count} {images} many clipped pixels. The worst is {path}: {text}"
-
-    def _old_note(self) -> str:
-        """Return a note about pictures made by other versions of clpipe or of image libraries."""
-        count = self._summary.old
-        text = (
-            f"{count} picture{'s were' if count > 1 else ' was'} made by another version of clpipe "
-        )
-        text += "or of image libraries, "
-        if self._keeps_old:
-            return f"{text}and {'stay' if count > 1 else 'stays'} (--redo missing)"
-        return f"{text}and {'are' if count > 1 else 'is'} recomputed; --redo missing keeps them"
-
-    def _print_left_out(self) -> None:
-        """Print notes about pictures of other versions, and about images that were left out."""
-        if self._summary.old:
-            self.print(self._old_note())
-        without = self._summary.without_picture
+    def _notes(self) -> Iterator[str]:
+        """Yield notes about clipped, old and omitted pictures."""
+        summary, without = self._summary, self._summary.without_picture
+        if count := summary.much_clipped:
+            share, path = summary.most_clipped
+            have = "images have" if count > 1 else "image has"
+            worst = f"{count} {have} many clipped pixels. The worst is {path}: "
+            start = worst if self._several else f"clpipe: {path}: warning: "
+            yield start + clipping_text(share)
+        if count := summary.old:
+            were, stay, are = ("s were", "stay", "are") if count > 1 else (" was", "stays", "is")
+            old = f"{count} picture{were} made by another version of clpipe or of image libraries"
+            redone = f"{are} recomputed; --redo missing keeps them"
+            yield f"{old}, and {f'{stay} (--redo missing)' if self._keeps_old else redone}"
         if without:
             hold = "images in directories have" if len(without) > 1 else "image in a directory has"
-            self.print(f"left out: {len(without)} {hold} no picture, such as {without[0]}")
-        if (kept := self._summary.counts[LEFT_OUT] - len(without)) > 0:
+            yield f"left out: {len(without)} {hold} no picture, such as {without[0]}"
+        if (kept := summary.counts[LEFT_OUT] - len(without)) > 0:
             were = "image in a directory was" if kept == 1 else "images in directories were"
-            self.print(f"left out: {kept} {were} kept after other stages")
+            yield f"left out: {kept} {were} kept after other stages"
 
     def end(self) -> None:
         """Remove the bar and print the summary."""
@@ -234,18 +222,15 @@ class Reporter:
         for text, count in self._warnings.items():
             if count > 1:
                 self.print(f"{count} images have this warning: {text}")
-        if summary.much_clipped and not self._quiet:
-            self.print(self._clipping_warning())
-        if not self._quiet:
-            self._print_left_out()
+        for note in () if self._quiet else self._notes():
+            self.print(note)
         failed = summary.failures
         is_done = summary.made == summary.total and not failed and not counts[SKIPPED]
         if self._quiet or (is_done and not self._several):
             return
         were = "was" if counts[SKIPPED] == 1 else "were"
-        existing = f" ({counts[SKIPPED]} of them {were} there already)" if counts[SKIPPED] else ""
-        if counts[SKIPPED] == summary.total == 1:
-            existing = " (it was there already)"
+        which = "it" if summary.total == 1 else f"{counts[SKIPPED]} of them"
+        existing = f" ({which} {were} there already)" * bool(counts[SKIPPED])
         done = counts[DONE] + counts[SKIPPED]
         images = "image" if summary.total == 1 else "images"
         text = f"{done} of {summary.total} {images} done{existing}, {counts[FAILED]} failed"

@@ -17,7 +17,13 @@ from clpipe.batch.session import Run
 from clpipe.chain.keys import KEYS
 from clpipe.chain.options import OPTIONS
 from clpipe.commands.chain_options import SETTINGS, options, out_option, set_option, settings_in
-from clpipe.commands.options import EXISTING, GroupedCommand, json_lines_option, quiet_option
+from clpipe.commands.options import (
+    EXISTING,
+    GroupedCommand,
+    Option,
+    json_lines_option,
+    quiet_option,
+)
 from clpipe.commands.progress import follow, print_line
 from clpipe.inputs.annotations import Annotations, read_json
 from clpipe.inputs.bop import is_by_image, read_bop
@@ -31,10 +37,12 @@ RUN_OPTIONS = [name for name in OPTIONS if name not in ("inputs", "output")]
 @click.command("run", cls=GroupedCommand)
 @click.argument("inputs", nargs=-1, metavar="INPUT...")
 @out_option
-@options(*RUN_OPTIONS, *SETTINGS, KEYS["dump"])
 @set_option
+@options(*RUN_OPTIONS, *SETTINGS, KEYS["dump"])
 @click.option(
     "--annotations",
+    cls=Option,
+    heading="+Inputs",
     type=EXISTING,
     metavar="PATH",
     help="Annotations of renders in the format of COCO, BOP or KITTI: COCO's JSON file, a "

@@ -28,12 +28,7 @@ LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 @click.argument("name", required=False, shell_complete=steps)
 @options(KEYS["camera"], KEYS["iso"], CODE)
 @json_option
-def stages(
-    name: str | None,
-    stage_files: tuple[Path, ...],
-    as_json: bool,
-    **values: Any,
-) -> None:
+def stages(name: str | None, stage_files: tuple[Path, ...], as_json: bool, **values: Any) -> None:
     """List the stages, or explain the methods and parameters of one.
 
     Automatic parameters are shown with their values for the camera and the ISO.
@@ -152,15 +147,9 @@ def explain_stage(stage: Stage, settings: Settings) -> None:
         click.echo(f"\nmethod {method.method}: {method.summary}")
         rows = parameter_rows(method)
         automatic = resolved(method, context)
-        headings = [
-            "parameter",
-            "default",
-            *([condition] if automatic else []),
-            "unit",
-            "allowed",
-            "",
-        ]
+        headings = ["parameter", "default", "unit", "allowed", ""]
         if automatic:
+            headings.insert(2, condition)
             rows = [(row[0], row[1], automatic.get(row[0], ""), *row[2:]) for row in rows]
         if rows:
             show(headings, rows)

@@ -92,8 +92,7 @@ def estrin(coefficients: Floats, x: Floats) -> Floats:
     """
     x2 = x * x
     x4 = x2 * x2
-    total = np.zeros_like(x)
-    power = np.ones_like(x)
+    total, power = x, x
     for i in range(0, len(coefficients), 4):
         c = coefficients[i : i + 4]
         group = x * c[1] + c[0] if len(c) > 1 else np.full_like(x, c[0])

@@ -16,21 +16,13 @@ from torch import Tensor
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Step
 from clpipe.reference.filter_array import periodic_indices
-from clpipe.reference.random import Stream
+from clpipe.reference.random import Stream, in_upper_half
+from clpipe.reference.tukey_lambda import tukey_lambda_of
 from clpipe.stage.signal import Backend, ExtraArguments, no_arguments
 from clpipe.torch import numbers
-from clpipe.torch.numbers import Streams, f32
-from clpipe.torch.poisson import poisson_of
+from clpipe.torch.numbers import Streams
 
 MAX_CACHED_MAPS = 256  # cached sensor maps, each a few MB at most
-
-
-def tukey_lambda_of(words: Tensor, shape: Tensor, scale: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.tukey_lambda.tukey_lambda_of`."""
-    p = numbers.tail_probability(words)
-    low, high = (numbers.exponential_minus_1(numbers.negative_log(q) * -shape) for q in (p, 1 - p))
-    z = (high - low) * scale
-    return torch.where(words >= 0, z, -z)
 
 
 class PoissonNumbers(torch.autograd.Function):
@@ -38,7 +30,7 @@ class PoissonNumbers(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, mean: Tensor, words: Tensor) -> Tensor:
-        return poisson_of(mean, words)
+        return numbers.poisson_of(mean, words)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
@@ -86,7 +78,8 @@ class TorchBackend(Backend):
     inverse_root = staticmethod(numbers.inverse_root)
     rounded = staticmethod(StraightThroughRound.apply)
     photons = staticmethod(PoissonNumbers.apply)
-    tukey_lambda = staticmethod(tukey_lambda_of)
+    in_upper_half = staticmethod(numbers.on_tensors(in_upper_half))
+    tukey_lambda = staticmethod(numbers.on_tensors(tukey_lambda_of))
 
     def tap(self, image: Tensor, dx: int, dy: int) -> Tensor:
         """The counterpart of :meth:`clpipe.stage.signal.NumpyBackend.tap`."""
@@ -104,10 +97,6 @@ class TorchBackend(Backend):
             image = torch.take_along_dim(image, indices.reshape(shape).to(image.device), axis)
         return image
 
-    @staticmethod
-    def in_upper_half(words: Tensor) -> Tensor:
-        return words >= 0
-
     def normals(self, draw: int = 0) -> Tensor:
         return numbers.normal_at(*self.size, draw, self.streams)
 
@@ -119,8 +108,8 @@ class TorchBackend(Backend):
 
     def uniform(self) -> Tensor:
         zero = torch.zeros(1, 1, 1, dtype=torch.int64, device=self._device)
-        bits = (numbers.philox(zero, 0, 0, self.streams)[0] >> 1) & numbers.LOW
-        return bits.float() * f32(4.6566129e-10)
+        bits = (numbers.philox(zero, 0, 0, self.streams)[0] >> 1) & 0x7FFFFFFF
+        return bits.float() * float(np.float32(4.6566129e-10))
 
     def rows(self) -> Tensor:
         return torch.arange(self.size[0], dtype=torch.float32, device=self._device)[None, :, None]

@@ -1,23 +1,26 @@
-"""Random numbers and short polynomials on tensors, bit for bit equal to :mod:`clpipe.reference`.
+"""Random numbers on tensors, bit for bit equal to :mod:`clpipe.reference`.
 
-PyTorch cannot multiply unsigned 32-bit words, so words are stored in ``int64``, where a product
-keeps its low 64 bits. Images are (sample, height, width), and each sample has its own key. Apart
-from :func:`square_root` and :func:`inverse_root`, the arguments of all functions do not depend on
-an image, so they have no derivatives.
+Functions of single numbers, such as normals of random words, are those of the reference: they run
+on tensors that have NumPy's interface. PyTorch cannot multiply unsigned 32-bit words, so Philox's
+words are stored in ``int64``, where a product keeps its low 64 bits. Images are (sample, height,
+width), and each sample has its own key. Apart from :func:`square_root` and :func:`inverse_root`,
+functions have no derivatives.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from numpy.lib.mixins import NDArrayOperatorsMixin
 from torch import Tensor
 
-from clpipe.reference.math import LOG_COEFFICIENTS, POWER_COEFFICIENTS
-from clpipe.reference.random import COSINE_COEFFICIENTS, NORMAL_COEFFICIENTS, SINE_COEFFICIENTS
+from clpipe.reference import math, random
+from clpipe.reference.poisson import LARGE, poisson_large, poisson_small
 
 WORD = 0xFFFFFFFF
-LOW, SIGN = 0x7FFFFFFF, -0x80000000  # the low 31 bits and the sign bit of an int32
 
 Words: TypeAlias = Tensor | int
 
@@ -35,65 +38,77 @@ class Streams:
     stage: int
 
 
-def f32(value: float | np.float32) -> float:
-    """Convert a float32 to a Python number, so that an operation on a tensor does not round it."""
-    return float(np.float32(value))
+# NumPy's types and functions whose names differ in PyTorch.
+TYPES: dict[Any, Any] = {np.float32: torch.float32, np.int32: torch.int32}
+FUNCTIONS = {"left_shift": torch.bitwise_left_shift, "right_shift": torch.bitwise_right_shift}
 
 
-def estrin(coefficients: Any, x: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.math.estrin`."""
-    values = [float(c) for c in coefficients]
-    x2 = x * x
-    x4 = x2 * x2
-    total, power = x, x
-    for i in range(0, len(values), 4):
-        c = values[i : i + 4]
-        group = (x * c[1]).add_(c[0]) if len(c) > 1 else torch.full_like(x, c[0])
-        if len(c) == 3:
-            group += x2 * c[2]
-        elif len(c) == 4:
-            group += (x * c[3]).add_(c[2]).mul_(x2)
-        total = group if i == 0 else total.add_(group.mul_(power))
-        power = x4 if i == 0 else power * x4
-    return total
+class Array(NDArrayOperatorsMixin):
+    """A tensor with NumPy's interface, as far as :mod:`clpipe.reference` uses it.
+
+    >>> (np.float32(0.5) * Array(torch.tensor([2.0, -4.0]))).tensor
+    tensor([ 1., -2.])
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor
+
+    def __array_ufunc__(self, function: np.ufunc, method: str, *inputs: Any) -> "Array":
+        return self._call(function, inputs)
+
+    def __array_function__(
+        self, function: Callable[..., Any], types: Any, inputs: Any, keywords: Mapping[str, Any]
+    ) -> "Array":
+        return self._call(function, inputs)
+
+    def _call(self, function: Callable[..., Any], inputs: Any) -> "Array":
+        tensors = [x.tensor if isinstance(x, Array) else _constant(x) for x in inputs]
+        name = function.__name__
+        found = FUNCTIONS[name] if name in FUNCTIONS else getattr(torch, name)
+        return Array(found(*tensors))
+
+    def view(self, type_: type) -> "Array":
+        """Return the same bits as another type."""
+        return Array(self.tensor.view(TYPES[type_]))
+
+    def astype(self, type_: type) -> "Array":
+        """Return the same numbers as another type."""
+        return Array(self.tensor.to(TYPES[type_]))
 
 
-def negative_log(t: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.math.negative_log`."""
-    bits = t.view(torch.int32)
-    exponent = (bits - 0x3F3504F3) >> 23
-    y = (bits - (exponent << 23)).view(torch.float32).sub_(1)
-    polynomial = estrin(LOG_COEFFICIENTS, y)
-    return exponent.float().mul_(f32(-0.6931472)).sub_(polynomial.mul_(y))
+@lru_cache(maxsize=256, typed=True)
+def _constant(value: Any) -> Tensor:
+    return torch.as_tensor(value)
 
 
-def exponential_minus_1(x: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.math.exponential_minus_1`."""
-    s, e = _power_of_two(x * f32(1.442695))
-    return s * e + (s - 1)
+def on_tensors(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of NumPy arrays as a function of tensors, without a derivative.
+
+    >>> on_tensors(math.square_root)(torch.tensor([4.0, 9.0])).round(decimals=4)
+    tensor([2., 3.])
+    """
+
+    def on(*tensors: Tensor) -> Any:
+        result = function(*map(Array, tensors))
+        return tuple(x.tensor for x in result) if isinstance(result, tuple) else result.tensor
+
+    return on
 
 
-def exponential(x: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.math.exponential`."""
-    s, e = _power_of_two(x * f32(1.442695))
-    return s + s * e
+raw_inverse_root = on_tensors(math.inverse_root)
+normal_of = on_tensors(random.normal_of)
+normals_of = on_tensors(random.normals_of)
+large_poisson = on_tensors(poisson_large)
+small_poisson = on_tensors(poisson_small)
 
 
-def _power_of_two(x: Tensor) -> tuple[Tensor, Tensor]:
-    whole = (x + 12582912.0) - 12582912.0
-    f = x - whole
-    s = ((whole.to(torch.int32) + 127) << 23).view(torch.float32)
-    return s, f * estrin(POWER_COEFFICIENTS, f)
-
-
-def raw_inverse_root(x: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.math.inverse_root`, without a derivative."""
-    half = x * 0.5
-    r = (0x5F375A86 - (x.view(torch.int32) >> 1)).view(torch.float32)
-    for _ in range(2):
-        # The product is (half * r) * r, in the same order as in the reference.
-        r = r * (half * r).mul_(r).neg_().add_(1.5)
-    return r
+def poisson_of(mean: Tensor, words: Tensor) -> Tensor:
+    """The counterpart of :func:`clpipe.reference.poisson.poisson_of`."""
+    result: Tensor = large_poisson(mean.clamp(min=float(LARGE)), words)
+    small = mean < float(LARGE)
+    # Use the sum only for small means, because it takes most of the time.
+    result[small] = small_poisson(mean[small], words[small])
+    return result
 
 
 class _InverseRoot(torch.autograd.Function):
@@ -156,38 +171,6 @@ def philox(c0: Words, c1: Words, draw: int, streams: Streams) -> tuple[Tensor, .
         key0, key1 = (key0 + 0x9E3779B9) & WORD, (key1 + 0xBB67AE85) & WORD
     words = torch.broadcast_tensors(*(torch.as_tensor(w) for w in (w0, w1, w2, w3)))
     return tuple(word.to(torch.int32) for word in words)
-
-
-def tail_probability(words: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.random.tail_probability`."""
-    return (words & LOW).float().add_(0.5).mul_(f32(2.3283064e-10))
-
-
-def normal_of(words: Tensor) -> Tensor:
-    """The counterpart of :func:`clpipe.reference.random.normal_of`."""
-    p = tail_probability(words)
-    w = negative_log(p * 4 * (1 - p))
-    s = (w := w.clamp_(min=0)) * raw_inverse_root(w) - 2.25
-    z = estrin(NORMAL_COEFFICIENTS, s) * (1 - p * 2)
-    return (z.view(torch.int32) ^ (words & SIGN)).view(torch.float32)
-
-
-def normals_of(distance: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """The counterpart of :func:`clpipe.reference.random.normals_of`."""
-    u = (distance & LOW).float().add_(0.5).mul_(f32(4.6566129e-10))
-    squared = negative_log(u).clamp_(min=0)
-    radius = raw_inverse_root(squared).mul_(squared)
-    f = (direction << 2).float().mul_(f32(4.6566129e-10))
-    f2 = f * f
-    s0, s1, s2 = map(float, SINE_COEFFICIENTS)
-    c0, c1, c2 = map(float, COSINE_COEFFICIENTS)
-    sine = (f2 * s2).add_(s1).mul_(f2).add_(s0).mul_(f)
-    cosine = (f2 * c2).add_(c1).mul_(f2).add_(c0)
-    sign = (direction << 1) & SIGN
-    signed = cosine.view(torch.int32).bitwise_xor_(sign).view(torch.float32)
-    swapped = direction < 0
-    first = torch.where(swapped, sine, signed).mul_(radius)
-    return first, torch.where(swapped, signed, sine).mul_(radius)
 
 
 def words_at(height: int, width: int, draw: int, streams: Streams) -> tuple[Tensor, ...]:

@@ -85,19 +85,18 @@ class RawNoise(ReadOnly, nn.Module):
         self._settings = overlay(load_settings(*as_texts(config)), values)
         self._seed = seed
         self._place = Place()
+        self._chains: BoundedCache[Chain] = BoundedCache(MAX_CHAINS)  # empty in a pickled copy
+        self._tables: BoundedCache[Table] = BoundedCache(1)
         self._start()
         Table([self._chain("")])  # raises an error for stages without a PyTorch version
 
     def _start(self) -> None:
-        """Begin the sequence of noise, without any chain."""
+        """Begin the sequence of noise."""
         self._random = torch.Generator()
         self._seeded: tuple[str, ...] | None = None  # the place for which the generator is seeded
-        self._table: Table | None = None
-        self._chains: BoundedCache[Chain] = BoundedCache(MAX_CHAINS)
 
     def __getstate__(self) -> dict[str, Any]:
-        caches = ("_random", "_seeded", "_table", "_chains")
-        state = {name: value for name, value in vars(self).items() if name not in caches}
+        state = {k: v for k, v in vars(self).items() if k not in ("_random", "_seeded")}
         return {**state, "_settings": self._settings.record()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -170,8 +169,7 @@ class RawNoise(ReadOnly, nn.Module):
         count, cell = len(mosaic), 2 if mosaic.shape[1] == 4 else 1
         size = cell * mosaic.shape[2], cell * mosaic.shape[3]
         if keys is None:
-            self._table = self._table or self._all_chains()
-            table = self._table
+            table = self._tables.get((), self._all_chains)
             self._seed_generator()
 
             def random(high: int, *shape: int) -> Tensor:
@@ -182,18 +180,15 @@ class RawNoise(ReadOnly, nn.Module):
             positions = [(row, column) for row, column in offsets]
             area = size[0] + POSITION_RANGE, size[1] + POSITION_RANGE
             return SampleDraws(table, chains, random(1 << 32, 2, count), positions, area)
-        chains_by_key = [self._chains.get(key, partial(self._chain, key)) for key in keys]
-        unique_chains = list({id(chain): chain for chain in chains_by_key}.values())
-        table = Table(unique_chains)
-        chains = np.array(
-            [next(i for i, c in enumerate(unique_chains) if c is chain) for chain in chains_by_key]
-        )
+        chains_by_key = [self._chain(key) for key in keys]
+        unique_chains = list(dict.fromkeys(chains_by_key))
+        chains = np.array([unique_chains.index(chain) for chain in chains_by_key])
         streams = [
             chain.stream(chain.steps[0].name, NoiseScope.IMAGE, key)
             for chain, key in zip(chains_by_key, keys, strict=True)
         ]
         words = torch.tensor([[s.key0 for s in streams], [s.key1 for s in streams]])
-        return SampleDraws(table, chains, words, [(0, 0)] * count, size)
+        return SampleDraws(Table(unique_chains), chains, words, [(0, 0)] * count, size)
 
     def _seed_generator(self) -> None:
         """Seed the generator for a call, or once in each place if the object has a seed."""
@@ -212,10 +207,10 @@ class RawNoise(ReadOnly, nn.Module):
 
     def _chain(self, name: str) -> Chain:
         """Return the chain of a sample's name, on which draws depend."""
-        if not self._settings.draws:
-            name = ""
+        name = name if self._settings.draws else ""
         first, last = (stage_in(role).name for role in (StageRole.SENSOR, StageRole.LEVELS))
-        return make_chain(self._settings.drawn(name), start_at=first, until=last)
+        make = partial(make_chain, start_at=first, until=last)
+        return self._chains.get(name, lambda: make(self._settings.drawn(name)))
 
 
 def _unpacked(planes: Tensor, order: Tensor) -> Tensor:

@@ -48,14 +48,12 @@ class Variant:
         steps: the step of each chain; None if it has another method.
         sensors: for each chain, the stream of values that are fixed to its camera.
         numbers: the kernel's arguments by name, (chain,); 0 for chains with another method.
-        stage: the stage's number in random streams.
     """
 
     method: type[SignalMethod]
     steps: Sequence[Step | None]
     sensors: Sequence[Stream]
     numbers: dict[str, NDArray[np.float32]]
-    stage: int
 
     def noisy(self, mosaics: Tensor, draws: SampleDraws, samples: NDArray[np.intp]) -> Tensor:
         """Return the mosaics of a batch after this method, which changes those of its chains."""
@@ -69,9 +67,10 @@ class Variant:
             selected, samples, chains = mosaics[rows], samples[has_method], chains[has_method]
         values = np.array([each[chains] for each in self.numbers.values()], np.float32)
         tensors = torch.from_numpy(values).to(device)[..., None, None]
+        stage = self.sensors[0].stage
         backend = TorchBackend(
             steps=[step for chain in chains if (step := self.steps[chain])],
-            streams=Streams(draws.keys[:, torch.from_numpy(samples)].to(device), self.stage),
+            streams=Streams(draws.keys[:, torch.from_numpy(samples)].to(device), stage),
             sensors=[self.sensors[chain] for chain in chains],
             positions=[draws.positions[sample] for sample in samples],
             area=draws.area,
@@ -151,7 +150,6 @@ def _variants(chains: Sequence[Chain], position: int) -> list[Variant]:
             for name in arguments[number]
         }
         sensors = [chain.stream(example.name, NoiseScope.CAMERA, "") for chain in chains]
-        stage = sensors[0].stage
         chain_steps = [steps.get(k) for k in range(len(chains))]
-        variants.append(Variant(method, chain_steps, sensors, numbers, stage))
+        variants.append(Variant(method, chain_steps, sensors, numbers))
     return variants

@@ -1,32 +1,24 @@
-"""Write the parts of the Python API's source that depend on stages and options.
+"""Write clpipe/chain/keywords.pyi, the types of the stages' parameters for editors and checkers.
 
     tools/run pages keywords
 
-These are clpipe/chain/keywords.pyi, for editors and type checkers, and the arguments in the
-docstring of ``clpipe.run``. Run this tool again after you have changed a parameter or an option; a
-test compares both files with its output.
+Run this tool again after you have changed a parameter; a test compares the file with its output.
 """
 
-import inspect
-import re
 import subprocess
 import sys
-import textwrap
 from collections.abc import Mapping
 from subprocess import PIPE
 from typing import Any
 
 from pydantic import BaseModel
 
-from clpipe.batch.api import run
-from clpipe.chain.keys import CODE, KEYS, Key
+from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.methods import TABLE_MODELS
-from clpipe.chain.options import OPTIONS
 from clpipe.chain.registry import all_stages
 from tools import ROOT
 
 PATH = ROOT / "clpipe" / "chain" / "keywords.pyi"
-API = ROOT / "clpipe" / "batch" / "api.py"
 
 START = '''"""Keywords of the Python API: the tables and keys of a configuration, with their types.
 
@@ -95,30 +87,6 @@ def text_of() -> str:
     return subprocess.run(command, input=written, stdout=PIPE, text=True, check=True).stdout
 
 
-def argument_of(key: Key) -> str:
-    """Return the entry of an option in a docstring."""
-    text = key.text if key.text[1].isupper() else key.text[0].lower() + key.text[1:]
-    listed = ", ".join(f'"{name}"' for name in key.choices)
-    choices = f" The choices are {listed}." if listed else ""
-    default = f" None is {key.default_text}." if key.default_text else ""
-    named = re.sub(
-        r"--([a-z-]+)",
-        lambda match: f"``{match[1].replace('-', '_')}``",
-        f"{key.name}: {text}{choices}{default}",
-    )
-    return textwrap.fill(named, 100, initial_indent=" " * 8, subsequent_indent=" " * 12)
-
-
-def api_text() -> str:
-    """Return the module of ``clpipe.run`` with the arguments in its docstring."""
-    names = [name for name in inspect.signature(run).parameters if name != "settings"]
-    before, start, rest = API.read_text("utf-8").partition("    Args:\n")
-    _, end, after = rest.partition("        **settings:")
-    arguments = "\n".join(argument_of(OPTIONS[name]) for name in names)
-    return f"{before}{start}{arguments}\n{end}{after}"
-
-
 if __name__ == "__main__":
-    for path, text in ((PATH, text_of()), (API, api_text())):
-        path.write_text(text, "utf-8")
-        print(path.relative_to(ROOT))
+    PATH.write_text(text_of(), "utf-8")
+    print(PATH.relative_to(ROOT))
