@@ -45,13 +45,14 @@ from clpipe.analysis.matching.space import (
     space_for,
     variants_of,
 )
-from clpipe.analysis.signature import DARK, flat_mask, luma
+from clpipe.analysis.signature import DARK, flat_mask
 from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.match import SearchProgress
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, jpeg_round_trip
 from clpipe.pipeline import Pipeline
+from clpipe.reference.colour import luma
 from tests.conftest import DATA, ROOT, run_cli
 
 SIZE, FRAMES = 128, 6

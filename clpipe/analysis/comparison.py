@@ -11,11 +11,11 @@ from clpipe.analysis.crops import Crop, choose_crops
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
 from clpipe.analysis.report import json_number
-from clpipe.analysis.signature import luma
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_line
 from clpipe.base.types import Doubles, Floats
+from clpipe.reference.colour import luma
 from clpipe.reference.transfer import srgb_curve
 
 LEVELS = 255  # sigmas are in 8-bit levels

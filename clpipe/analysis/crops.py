@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.analysis.signature import luma
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.reference.colour import luma
 
 WIDTH, HEIGHT = 96, 64  # px; the size of an automatic crop
 SMOOTH = 5  # px: the window over which noise is averaged before the search
@@ -153,7 +153,7 @@ def window_means(plane: Doubles | Mask) -> Doubles:
     >>> window_means(np.ones((65, 99))).shape
     (2, 4)
     """
-    total = np.pad(plane.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    total = np.pad(plane.cumsum(0, np.float64).cumsum(1), ((1, 0), (1, 0)))
     rows = total[HEIGHT:] - total[:-HEIGHT]
     return np.asarray((rows[:, WIDTH:] - rows[:, :-WIDTH]) / (HEIGHT * WIDTH))
 

@@ -22,7 +22,7 @@ from clpipe.base.extras import install_command, is_installed
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE, covariance, halved, select_flat
 from clpipe.reference.cfa import sites
-from clpipe.reference.colour import rgb_to_ycbcr
+from clpipe.reference.colour import luma, rgb_to_ycbcr
 from clpipe.stage import Kind
 
 # The share of valid pixels, the channels, the correlations of pairs of channels, and covariances.
@@ -103,8 +103,8 @@ def measure_against(
 
 def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:
     """Return the rms of luma's noise in the steepest pixels over that in the flattest."""
-    slopes = slopes_of(rgb_to_ycbcr(clean)[..., 0], np.all(unclipped, axis=-1))
-    return slopes.ratio(np.stack([rgb_to_ycbcr(frame)[..., 0] for frame in noise]))
+    slopes = slopes_of(luma(clean), np.all(unclipped, axis=-1))
+    return slopes.ratio(luma(noise))
 
 
 def finished(images: Sequence[Picture], truth: Picture | None) -> Figures:
@@ -217,8 +217,7 @@ def picture_channels(
     whole = covariance(noise)
     to_ycbcr = rgb_to_ycbcr(np.eye(3, dtype=np.float32)[None])[0]
     sigmas = np.sqrt([*np.diag(whole), *np.diag(to_ycbcr.T @ whole @ to_ycbcr)])
-    luma = rgb_to_ycbcr(clean)[..., 0]
-    planes = [clean[..., 0], clean[..., 1], clean[..., 2], luma, luma, luma]
+    planes = [*np.moveaxis(clean, -1, 0), *[luma(clean)] * 3]
     noises = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     pairs = count_pairs(mask)

@@ -19,15 +19,13 @@ from clpipe.analysis.signature import (
     BIN,
     DARK,
     DARKEST,
-    LUMA,
     MIN_SAMPLES,
-    chroma,
     flat_mask,
-    luma,
     noise_of,
 )
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.reference.colour import LUMA, luma, rgb_to_ycbcr
 
 MAX_LAG = 6  # px, the longest lag
 # Cycles per pixel; the edges of bands. The corner of the spectrum is at 0.71.
@@ -154,8 +152,8 @@ class Noise:
     @cached_property
     def planes(self) -> tuple[Doubles, Doubles, Doubles]:
         """Luma, Cb and Cr, (frame, height, width) each."""
-        y = self.rgb @ LUMA.astype(self.rgb.dtype)
-        return y, *chroma(self.rgb, y)
+        y, cb, cr = np.ascontiguousarray(np.moveaxis(rgb_to_ycbcr(self.rgb), -1, 0))
+        return y, cb, cr
 
 
 def noise_of_frames(

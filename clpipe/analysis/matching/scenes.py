@@ -20,13 +20,14 @@ from clpipe.analysis.matching.columns import (
     block_numbers,
     noise_of_frames,
 )
-from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask, luma
+from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.base.url_text import local
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
+from clpipe.reference.colour import luma
 from clpipe.reference.image import in_blocks
 
 MAX_UNCROPPED = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
