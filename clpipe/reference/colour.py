@@ -1,8 +1,13 @@
 """Luma and colour differences, like in ``kernels/lib/colour.h``."""
 
+from typing import Any, TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from clpipe.base.types import Array, Floats
+
+Float = TypeVar("Float", bound=np.floating[Any])
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -16,7 +21,7 @@ def luma(image: Array) -> Array:
     return np.asarray(LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue)
 
 
-def rgb_to_ycbcr(image: Array) -> Array:
+def rgb_to_ycbcr(image: NDArray[Float]) -> NDArray[Float]:
     """Apply ITU-R BT.601: :func:`luma` Y, Cb = 0.564(B-Y), Cr = 0.713(R-Y).
 
     ``image`` is (..., 3) RGB, in floats. The result has the same shape and precision.

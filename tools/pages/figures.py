@@ -33,10 +33,10 @@ from matplotlib.figure import Figure
 
 from clpipe.analysis.comparison import Comparison, Row, compare
 from clpipe.analysis.comparison_plot import METADATA, STYLE, draw
-from clpipe.analysis.matching.columns import MAX_LAG, spectrum_of
+from clpipe.analysis.matching.columns import MAX_LAG
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
-from clpipe.analysis.spatial import LAGS
+from clpipe.analysis.spatial import LAGS, spectrum_of
 from clpipe.analysis.statistics import Channel
 from clpipe.base.errors import ClpipeError
 from tools import RENDER

@@ -23,7 +23,7 @@ from clpipe.analysis.signature import (
     flat_mask,
     noise_of,
 )
-from clpipe.analysis.spatial import energy_left
+from clpipe.analysis.spatial import autocorrelation, count_pairs, energy_left, spectrum_of
 from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.reference.colour import LUMA, luma, rgb_to_ycbcr
 
@@ -130,9 +130,15 @@ class ValidPixels:
 
     @cached_property
     def pairs(self) -> Doubles:
-        """The number of bright pairs at each lag, (13, 13); NaN if there is none."""
-        count = products(self.bright[None].astype(np.float64)).round()
-        return np.where(count > 0, count, np.nan)
+        """The number of bright pairs at each lag, (13, 13)."""
+        return count_pairs(self.bright, MAX_LAG)
+
+    def autocorrelation(self, plane: Doubles) -> Doubles:
+        """Return the autocorrelation of noise, (frame, height, width), in the bright pixels.
+
+        It is (13, 13), with lag 0 in the middle.
+        """
+        return autocorrelation((plane * self.bright).astype(np.float32), self.pairs)
 
 
 Figures = dict[str, float]  # figures by names of COLUMNS; NaN if a figure cannot be computed
@@ -182,7 +188,7 @@ def figures_of(noise: Noise, places: ValidPixels) -> Figures:
         return found
     names = ("right", "below", "diagonal", "two_right", "two_below", *LONG_LAGS_RIGHT)
     y, cb, cr = noise.planes
-    luma_map, *chroma_maps = (autocorrelation(plane, places) for plane in (y, cb, cr))
+    luma_map, *chroma_maps = map(places.autocorrelation, (y, cb, cr))
     chroma_map = (chroma_maps[0] + chroma_maps[1]) / 2
     samples = noise.rgb[:, mask].reshape(-1, 3)
     power = np.einsum("ni,nj->ij", samples, samples, dtype=np.float64) / len(samples)
@@ -243,53 +249,6 @@ def named_lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
     """Return named lags of a map of autocorrelation."""
     places = {name: (MAX_LAG + LAGS[name][0], MAX_LAG + LAGS[name][1]) for name in names}
     return {f"{prefix}{name}": float(table[place]) for name, place in places.items()}
-
-
-def products(planes: Doubles) -> Doubles:
-    """Return the sums of products at all lags up to 6 px, (13, 13) with lag 0 in the middle.
-
-    They are computed from the power spectrum (Wiener and Khinchin). Matrix products would need no
-    second transform, but BLAS takes longer to start its threads.
-
-    Args:
-        planes: (frame, height, width), which are 0 beyond their borders.
-    """
-    from scipy import fft
-
-    height, width = (fft.next_fast_len(size + MAX_LAG, real=True) for size in planes.shape[1:])
-    waves = fft.rfft2(planes.astype(np.float32), (height, width))
-    power = (waves.real**2 + waves.imag**2).sum(0)
-    steps = np.arange(-MAX_LAG, MAX_LAG + 1)
-    rows = fft.ifft(power, axis=0)[steps]
-    return np.asarray(fft.irfft(rows, width)[:, steps], np.float64)
-
-
-def autocorrelation(plane: Doubles, places: ValidPixels) -> Doubles:
-    """Return the autocorrelation of noise at lags up to 6 px, (13, 13) with lag 0 in the centre.
-
-    It is computed over all frames. Opposite lags are averaged.
-
-    Args:
-        plane: (frame, height, width).
-        places: the valid pixels.
-    """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        covariance = products(plane * places.bright) / (places.pairs * len(plane))
-        return np.asarray(covariance / covariance[MAX_LAG, MAX_LAG])
-
-
-def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the power spectrum of an autocorrelation, and the frequencies, (64, 64) each.
-
-    It is the transform of the autocorrelation with a triangular window (Blackman and Tukey, 1958;
-    the window is Bartlett's). Independent noise has 1 everywhere. Frequencies are in cycles per
-    pixel.
-    """
-    steps, frequency = np.arange(-MAX_LAG, MAX_LAG + 1), np.fft.fftfreq(64)
-    fall = 1 - np.abs(steps) / (MAX_LAG + 1)
-    waves = np.exp(-2j * np.pi * np.outer(frequency, steps))
-    spectrum = (waves @ (np.nan_to_num(table) * np.outer(fall, fall)) @ waves.T).real
-    return spectrum, np.hypot(frequency[:, None], frequency[None])
 
 
 def bands(table: Doubles) -> Figures:

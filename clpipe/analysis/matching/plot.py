@@ -12,10 +12,9 @@ from clpipe.analysis.matching.columns import (
     MAX_LAG,
     Noise,
     ValidPixels,
-    autocorrelation,
-    spectrum_of,
 )
 from clpipe.analysis.matching.result import Match, Row
+from clpipe.analysis.spatial import spectrum_of
 from clpipe.base.files import write_new
 from clpipe.base.types import Doubles
 
@@ -44,8 +43,8 @@ def draw(match: Match, path: Path) -> None:
 def mean_table(match: Match, who: str, planes: Sequence[int]) -> Doubles:
     """Return the mean autocorrelation of planes (0 luma, 1 Cb, 2 Cr) of "theirs" or "ours"."""
     tables = [
-        autocorrelation(
-            getattr(scene, who).planes[plane], ValidPixels(scene.mask, scene.theirs.level)
+        ValidPixels(scene.mask, scene.theirs.level).autocorrelation(
+            getattr(scene, who).planes[plane]
         )
         for scene in match.noises
         for plane in planes

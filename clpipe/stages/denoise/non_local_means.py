@@ -92,7 +92,7 @@ class NonLocalMeans(WindowDenoiser):
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         n = self.numbers(inputs.context)
         units = np.array([n["luma_unit"], n["chroma_unit"], n["chroma_unit"]], np.float32)
-        planes: Floats = rgb_to_ycbcr(image) / units
+        planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))
         variance = level * n["noise_slope"] + n["noise_offset"]
         biases, scales = (n["luma_bias"], n["chroma_bias"]), (n["luma_scale"], n["chroma_scale"])
