@@ -95,6 +95,24 @@ def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
     return spectrum, np.hypot(frequency[:, None], frequency[None])
 
 
+def radial_spectrum(table: Doubles, most: float, rings: int) -> tuple[Doubles, Doubles]:
+    """Return the mean power of an autocorrelation in rings of frequency, see :func:`spectrum_of`.
+
+    Args:
+        table: the autocorrelation.
+        most: the highest frequency, cycles/px.
+        rings: the number of rings.
+
+    Returns:
+        The frequencies in the middle of the rings, and the power: 1 for independent noise.
+    """
+    spectrum, radius = spectrum_of(table)
+    edges = np.linspace(0, most, rings + 1)
+    number = np.digitize(radius, edges)
+    power = [spectrum[number == k].mean() for k in range(1, len(edges))]
+    return (edges[1:] + edges[:-1]) / 2, np.array(power)
+
+
 def line_noise(noise: Floats, mask: Mask) -> LineNoise:
     """Return the sigma of the offset that all pixels of a row share; transpose for columns.
 

@@ -11,9 +11,9 @@ from clpipe.analysis.finished import finished_rows
 from clpipe.analysis.intensity import VarianceLaw
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
+from clpipe.analysis.plot import law_svg, noise_svg
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.statistics import Channel
-from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
 from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.rendition import DEVELOPMENT, MOSAIC

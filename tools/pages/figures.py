@@ -36,7 +36,7 @@ from clpipe.analysis.comparison_plot import METADATA, STYLE, draw
 from clpipe.analysis.matching.columns import MAX_LAG
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
-from clpipe.analysis.spatial import LAGS, spectrum_of
+from clpipe.analysis.spatial import LAGS, radial_spectrum
 from clpipe.analysis.statistics import Channel
 from clpipe.base.errors import ClpipeError
 from tools import RENDER
@@ -226,12 +226,7 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
         of_picture.plot(curve.mean * LEVELS, curve.sigma * LEVELS, "o-", markersize=3, label=label)
         lags.plot(range(LAGS + 1), table[LAGS, LAGS:], "o-", markersize=3, label=label)
         near = slice(LAGS - MAX_LAG, LAGS + MAX_LAG + 1)
-        power, radius = spectrum_of(table[near, near])
-        rings = np.digitize(radius, edges := np.linspace(0, 0.5, 17))
-        middles = (edges[1:] + edges[:-1]) / 2
-        spectrum.plot(
-            middles, [power[rings == k].mean() for k in range(1, edges.size)], label=label
-        )
+        spectrum.plot(*radial_spectrum(table[near, near], 0.5, 16), label=label)
     caption(of_picture, "Picture: noise by intensity", "luma, levels", "sigma of luma, levels")
     caption(lags, "Picture: autocorrelation of luma", "px to the right", "correlation")
     caption(
