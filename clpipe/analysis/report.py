@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
+import numpy as np
+
 from clpipe.analysis.intensity import NoiseCurve
-from clpipe.analysis.spatial import LineNoise
 from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
 from clpipe.base.types import Doubles
 
@@ -46,70 +47,76 @@ class NoiseReport:
 
     def record(self) -> dict[str, Any]:
         """Return the report as JSON values; unknown values are null."""
-        return {
-            "kind": self.kind,
-            "unit": UNITS[self.kind],
-            "iso": self.iso,
-            "bursts": self.bursts,
-            "rounding_variance": self.rounding,
-            "images": list(self.images),
-            "truth": self.truth,
-            "width": self.width,
-            "height": self.height,
-            "share_used": self.share,
-            "notes": list(self.notes),
-            "channels": {channel.name: channel_record(channel) for channel in self.channels},
-            "edges_over_flat": json_number(self.at_edges),
-            "finished": {name: json_number(value) for name, value in self.finished.items()},
-            "covariance": {where: table.tolist() for where, table in self.covariances.items()},
-            "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
-            "frames": self.frames,
-            "temporal_correlation": {
-                name: list(map(json_number, values)) for name, values in self.temporal.items()
-            },
-        }
+        return json_object(
+            kind=self.kind,
+            unit=UNITS[self.kind],
+            iso=self.iso,
+            bursts=self.bursts,
+            rounding_variance=self.rounding,
+            images=self.images,
+            truth=self.truth,
+            width=self.width,
+            height=self.height,
+            share_used=self.share,
+            notes=self.notes,
+            channels={channel.name: channel_record(channel) for channel in self.channels},
+            edges_over_flat=self.at_edges,
+            finished=self.finished,
+            covariance=self.covariances,
+            correlation={f"{a}-{b}": r for (a, b), r in self.correlations.items()},
+            frames=self.frames,
+            temporal_correlation=self.temporal,
+        )
 
 
-def json_number(value: float) -> float | None:
-    """Return a number for JSON, in which NaN becomes null."""
-    return None if math.isnan(value) else float(value)
+def json_value(value: Any) -> Any:
+    """Return a value for JSON: data classes as objects, arrays as lists, and NaN as null.
+
+    >>> json_value({"a": np.array([1.5, np.nan]), "b": VarianceLaw(1, 2, 3, 4)})
+    {'a': [1.5, None], 'b': {'a': 1, 'b': 2, 'a_error': 3, 'b_error': 4}}
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if is_dataclass(value):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): json_value(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(each) for each in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def line_record(lines: LineNoise) -> dict[str, float | None]:
-    """Row or column noise as JSON values."""
-    return {name: json_number(value) for name, value in asdict(lines).items()}
+def json_object(**values: Any) -> dict[str, Any]:
+    """Return values by name as a JSON object, see :func:`json_value`."""
+    return {name: json_value(value) for name, value in values.items()}
 
 
-def curve_record(curve: NoiseCurve) -> dict[str, list[float]]:
+def curve_record(curve: NoiseCurve | None) -> dict[str, Any] | None:
     """Noise by intensity as JSON values."""
-    return {
-        "mean": curve.mean.tolist(),
-        "sigma": curve.sigma.tolist(),
-        "shift": curve.shift.tolist(),
-        "samples": curve.count.tolist(),
-    }
+    return (
+        None
+        if curve is None
+        else json_object(mean=curve.mean, sigma=curve.sigma, shift=curve.shift, samples=curve.count)
+    )
 
 
 def channel_record(channel: Channel) -> dict[str, Any]:
     """Return a channel as JSON values."""
-    law, tails = channel.law, channel.tails
-    whole = channel.whole_curve
-    return {
-        "samples": channel.count,
-        "sigma": channel.sigma,
-        "sigma_picture": channel.whole_sigma,
-        "law": law and asdict(law),
-        "intensity": curve_record(channel.curve),
-        "intensity_picture": whole and curve_record(whole),
-        "row": line_record(channel.rows),
-        "column": line_record(channel.columns),
-        "autocorrelation": [
-            [json_number(r) for r in row] for row in channel.autocorrelation.tolist()
-        ],
-        "energy_left_2x2": json_number(channel.energy_left),
-        "skewness": json_number(tails.skewness),
-        "excess_kurtosis": json_number(tails.excess_kurtosis),
-        "beyond": {str(k): json_number(p) for k, p in zip(SIGMAS, tails.beyond, strict=True)},
-        "gaussian_beyond": {str(k): gaussian_beyond(k) for k in SIGMAS},
-        "histogram": {"edges": HISTOGRAM.round(2).tolist(), "samples": tails.histogram.tolist()},
-    }
+    tails = channel.tails
+    return json_object(
+        samples=channel.count,
+        sigma=channel.sigma,
+        sigma_picture=channel.whole_sigma,
+        law=channel.law,
+        intensity=curve_record(channel.curve),
+        intensity_picture=curve_record(channel.whole_curve),
+        row=channel.rows,
+        column=channel.columns,
+        autocorrelation=channel.autocorrelation,
+        energy_left_2x2=channel.energy_left,
+        skewness=tails.skewness,
+        excess_kurtosis=tails.excess_kurtosis,
+        beyond=dict(zip(SIGMAS, tails.beyond, strict=True)),
+        gaussian_beyond={k: gaussian_beyond(k) for k in SIGMAS},
+        histogram={"edges": HISTOGRAM.round(2), "samples": tails.histogram},
+    )

@@ -92,6 +92,7 @@ def channel_statistics(
     pairs: Doubles,
     fits_line: bool,
     freedom: float = 1.0,
+    whole: Floats | None = None,
 ) -> Channel:
     """Return all statistics of one channel.
 
@@ -104,6 +105,7 @@ def channel_statistics(
         pairs: :func:`clpipe.analysis.spatial.count_pairs` of the mask.
         fits_line: whether to fit a line, because the variance is linear in the intensity.
         freedom: the degrees of freedom of a sample, below 1 if the truth is a mean of frames.
+        whole: the noise of all pixels, including invalid ones.
     """
     table = autocorrelation(standard, pairs)
     # Correlated samples count as fewer independent ones: their number is divided by the sum of the
@@ -132,4 +134,6 @@ def channel_statistics(
         autocorrelation=table,
         energy_left=energy_left(standard, mask),
         tails=tails(standard, mask),
+        whole_sigma=math.nan if whole is None else float(whole.std(dtype=np.float64)),
+        size=0 if whole is None else whole.size,
     )

@@ -11,8 +11,8 @@ from clpipe.analysis.finished import finished_rows
 from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
 from clpipe.analysis.pooling import pool_by_iso
-from clpipe.analysis.report import UNITS, NoiseReport
-from clpipe.analysis.snr import MIN_SAMPLES, SnrStep, record_of, snr_curve
+from clpipe.analysis.report import UNITS, NoiseReport, json_value
+from clpipe.analysis.snr import MIN_SAMPLES, SnrStep, snr_curve
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.analysis.temporal import measure_clip
@@ -132,7 +132,7 @@ def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
             "larger images"
         )
     if as_json:
-        show_json({"snr": record_of(curve)})
+        show_json({"snr": json_value(curve)})
         return
     rows = [
         (f"{x.intensity:.4g}", f"{x.stops:.1f}", f"{x.decibels:.1f}", str(x.samples)) for x in curve

@@ -5,13 +5,14 @@ from its shot noise and its pattern (EMVA 1288, release 4.0, 2021, describes bot
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
 from clpipe.analysis.calibration.dark_figures import sites_of, without_rows
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.analysis.report import json_object
 from clpipe.base.types import Doubles, Floats
 
 MIN_TIMES = 2
@@ -27,9 +28,7 @@ class DarkCurrent:
 
     def record(self) -> dict[str, object]:
         """Return the figures as JSON values."""
-        spread = self.spread and asdict(self.spread)
-        times = list(self.times)
-        return {"current_e_per_s": asdict(self.current), "spread": spread, "times_s": times}
+        return json_object(current_e_per_s=self.current, spread=self.spread, times_s=self.times)
 
 
 def dark_current(

@@ -4,7 +4,7 @@ Frames are (frame, height, width) in DN, of one ISO, exposure time and temperatu
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from clpipe.analysis.calibration.fixed_pattern import Pixels
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.analysis.report import json_object
 from clpipe.base.types import Array, Doubles, Floats, Mask
 from clpipe.reference.image import in_blocks
 
@@ -69,17 +70,17 @@ class DarkFigures:
 
     def record(self) -> dict[str, Any]:
         """Return the figures as JSON values."""
-        shading = self.shading and asdict(self.shading.variance.root())
-        return {
-            "color_bias_dn": [asdict(each) for each in self.color_bias],
-            "black_level_error_dn": self.black_level_error and asdict(self.black_level_error),
-            "tukey_lambda": self.tukey_lambda and asdict(self.tukey_lambda),
-            "banding_dn": self.banding and asdict(self.banding),
-            "dark_shading_dn": shading,
-            "dark_shading_length": self.shading and self.shading.length,
-            "rts_share": self.rts_share and asdict(self.rts_share),
-            "rts_amplitude_dn": self.rts_amplitude and asdict(self.rts_amplitude),
-        }
+        shading = self.shading
+        return json_object(
+            color_bias_dn=self.color_bias,
+            black_level_error_dn=self.black_level_error,
+            tukey_lambda=self.tukey_lambda,
+            banding_dn=self.banding,
+            dark_shading_dn=shading and shading.variance.root(),
+            dark_shading_length=shading and shading.length,
+            rts_share=self.rts_share,
+            rts_amplitude_dn=self.rts_amplitude,
+        )
 
 
 def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:

@@ -8,12 +8,13 @@ the instrument are stored.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.analysis.report import json_object
 from clpipe.base.types import Array
 
 CLASSES = 2048  # classes of the instrument, the variable that sorts pixels
@@ -81,13 +82,13 @@ class Line:
 
     def record(self, signal_range: float) -> dict[str, Any]:
         """Return a and b in signal units, gain and read noise in DN, each with its error."""
-        return {
-            "a": asdict(self.gain.scaled(1 / signal_range)),
-            "b": asdict(self.floor.scaled(1 / signal_range**2)),
-            "system_gain": asdict(self.gain),
-            "read_noise": asdict(self.floor.root()),
-            "pixels": self.pixels,
-        }
+        return json_object(
+            a=self.gain.scaled(1 / signal_range),
+            b=self.floor.scaled(1 / signal_range**2),
+            system_gain=self.gain,
+            read_noise=self.floor.root(),
+            pixels=self.pixels,
+        )
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The figures of EMVA 1288, release 3.1, each with its standard error."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.emva.moments import Moments, Spatial, Temporal
 from clpipe.analysis.emva.series import NS
+from clpipe.analysis.report import json_value
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Mask
 
@@ -75,11 +76,10 @@ class Figures:
 
     def record(self) -> dict[str, Any]:
         """Return the figures as JSON values, each with its error."""
-        plain = ("linearity", "saturated", "fitted")
-        values = {name: value for name, value in vars(self).items() if name not in plain}
-        own = {name: value and asdict(value) for name, value in values.items()}
-        limits = {"least": self.linearity.least, "most": self.linearity.most}
-        return {**own, "linearity_error": {name: asdict(e) for name, e in limits.items()}}
+        values = json_value(self)
+        linearity = values.pop("linearity")
+        del values["saturated"], values["fitted"]
+        return {**values, "linearity_error": {name: linearity[name] for name in ("least", "most")}}
 
 
 def figures(moments: Moments) -> Figures:
