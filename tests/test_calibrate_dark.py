@@ -11,7 +11,6 @@ from clpipe.analysis.calibration.dark_figures import (
     Shading,
     dark_figures,
     l_kurtosis,
-    sites_of,
     slope_and_offset,
 )
 from clpipe.analysis.calibration.fixed_pattern import Pixels
@@ -21,7 +20,6 @@ from clpipe.analysis.calibration.profile import calibrated_profile
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.camera.profile import parse_camera
 from clpipe.pipeline import Pipeline
-from clpipe.reference.cfa import PATTERNS
 
 UNIT = 16383 - 512
 READ = 3.0  # DN
@@ -195,14 +193,6 @@ def test_dark_frames_are_grouped_by_their_times():
     assert names(2.0) == [[3], [4], [1], [0, 2]]
     assert names(None) == [[4], [1], [3], [0, 2]]
     assert by_time([], 1.0) == [()]
-
-
-def test_sites_of_every_pattern():
-    for pattern in PATTERNS:
-        frame = np.array(list(pattern)).reshape(2, 2)
-        assert [frame[site][0, 0] for site in sites_of(pattern)] == ["R", "G", "G", "B"]
-        (red_row, _), (green_row, _) = sites_of(pattern)[:2]
-        assert red_row == green_row
 
 
 def test_one_iso_gives_an_offset_alone():

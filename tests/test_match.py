@@ -474,9 +474,9 @@ def test_a_smaller_picture_is_sharpened_before_or_after():
 def test_a_name_with_brackets_is_no_glob_where_it_exists(tmp_path):
     for name in ("a[1].jpg", "a1.jpg"):
         (tmp_path / name).touch()
-    assert expand([str(tmp_path / "a[1].jpg")], "FRAME") == [tmp_path / "a[1].jpg"]
+    assert expand([str(tmp_path / "a[1].jpg")]) == [tmp_path / "a[1].jpg"]
     (tmp_path / "a[1].jpg").unlink()
-    assert expand([str(tmp_path / "a[1].jpg")], "FRAME") == [tmp_path / "a1.jpg"]
+    assert expand([str(tmp_path / "a[1].jpg")]) == [tmp_path / "a1.jpg"]
 
 
 def test_a_third_is_kept_out_of_the_search(burst, tmp_path):

@@ -64,7 +64,7 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
     Crop(name='sky', left=10, top=20, width=30, height=40)
     """
     height, width = picture.shape[:2]
-    finder = _Finder(picture)
+    finder: _Finder | None = None
     places = []
     for text in texts or FOUND:
         if text in FOUND:
@@ -74,6 +74,7 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
                     f"needs {WIDTH}x{HEIGHT}; set the crop yourself, such as --crop "
                     f"0,0,{width}x{height}"
                 )
+            finder = finder or _Finder(picture)
             places.append(finder.find(text))
             continue
         match = MANUAL.fullmatch(text)
@@ -128,17 +129,13 @@ class _Finder:
     """Finds crops in one picture that do not overlap earlier ones, if there is space."""
 
     def __init__(self, picture: Floats) -> None:
-        self._picture = picture
-        self._smooth: Floats | None = None
-        self._free: Mask | None = None
+        from scipy import ndimage
+
+        self._smooth: Floats = ndimage.uniform_filter(picture, (SMOOTH, SMOOTH, 1))
+        height, width = picture.shape[:2]
+        self._free = np.ones((height - HEIGHT + 1, width - WIDTH + 1), bool)
 
     def find(self, name: str) -> Crop:
-        if self._smooth is None or self._free is None:
-            from scipy import ndimage
-
-            self._smooth = ndimage.uniform_filter(self._picture, (SMOOTH, SMOOTH, 1))
-            height, width = self._picture.shape[:2]
-            self._free = np.ones((height - HEIGHT + 1, width - WIDTH + 1), bool)
         score = _only(FOUND[name](self._smooth), self._free)
         top, left = map(int, np.unravel_index(score.argmax(), score.shape))
         self._free[

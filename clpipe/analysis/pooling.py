@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.analysis.calibration.line_fit import Estimate, weighted
 from clpipe.analysis.intensity import NoiseCurve, VarianceLaw, bin_edges, bin_of, pool_curves
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.spatial import LineNoise
@@ -113,13 +114,9 @@ def rebinned(curve: NoiseCurve, edges: Doubles) -> NoiseCurve:
 
 def pool_laws(laws: Sequence[VarianceLaw]) -> VarianceLaw:
     """Return the mean of several laws, weighted by the inverse of their squared errors."""
-    numbers = []
-    for name in ("a", "b"):
-        values = np.array([getattr(law, name) for law in laws])
-        weights = np.array([getattr(law, f"{name}_error") for law in laws]).clip(1e-300) ** -2.0
-        numbers.append((float(np.average(values, weights=weights)), float(weights.sum() ** -0.5)))
-    (a, a_error), (b, b_error) = numbers
-    return VarianceLaw(a, b, a_error, b_error)
+    a = weighted([Estimate(law.a, law.a_error) for law in laws])
+    b = weighted([Estimate(law.b, law.b_error) for law in laws])
+    return VarianceLaw(a.value, b.value, a.error, b.error)
 
 
 def pool_lines(lines: Sequence[LineNoise], count: Doubles) -> LineNoise:

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.analysis.calibration.dark_figures import sites_of, without_rows
+from clpipe.analysis.calibration.dark_figures import without_rows
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.analysis.report import json_object
 from clpipe.base.types import Doubles, Floats
+from clpipe.reference.cfa import sites
 
 MIN_TIMES = 2
 
@@ -82,7 +83,7 @@ def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
     freedom = of_pixels.size * (count - 1)
     scatter = float(of_pixels.std()) / of_pixels.size**0.5
     flat = mean.copy()
-    for site in sites_of(sensor.bayer):
+    for site in sites(sensor.bayer).values():
         part = flat[site]
         part -= part.mean(axis=0, keepdims=True)
         part -= part.mean(axis=1, keepdims=True)

@@ -41,6 +41,12 @@ class Estimate:
         """Return value and error times a factor, for example to convert the unit."""
         return Estimate(self.value * factor, self.error * abs(factor))
 
+    def over(self, below: "Estimate") -> "Estimate":
+        """Return the quotient of two estimates whose errors are independent."""
+        value = self.value / below.value
+        error = np.hypot(self.error, value * below.error) / below.value
+        return Estimate(value, float(error))
+
     def root(self) -> "Estimate":
         """Return the standard deviation, if this is a variance.
 
@@ -54,6 +60,13 @@ class Estimate:
             return Estimate(0.0, float(np.sqrt(self.error)))
         root = float(np.sqrt(self.value))
         return Estimate(root, self.error / (2 * root))
+
+
+def weighted(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the mean of estimates, weighted by their inverse squared errors."""
+    weight = np.array([max(e.error, 1e-150) ** -2.0 for e in estimates])
+    value = np.average([e.value for e in estimates], weights=weight)
+    return Estimate(float(value), float(weight.sum() ** -0.5))
 
 
 @dataclass(frozen=True)
