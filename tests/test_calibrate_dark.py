@@ -10,7 +10,6 @@ from clpipe.analysis.calibration.dark_current import dark_current
 from clpipe.analysis.calibration.dark_figures import (
     Shading,
     dark_figures,
-    l_kurtosis,
     slope_and_offset,
 )
 from clpipe.analysis.calibration.fixed_pattern import Pixels
@@ -73,12 +72,6 @@ def test_the_shape_of_read_noise(shape, frames):
     assert found is not None
     assert within(found, shape, 5.0)
     assert found.error < 0.03
-
-
-def test_gaussian_noise_has_its_l_kurtosis():
-    normal = np.random.default_rng(0).normal(size=1_000_000)
-    assert l_kurtosis(normal) == pytest.approx(0.1226, abs=0.001)
-    assert l_kurtosis(np.random.default_rng(0).random(1_000_000)) == pytest.approx(0, abs=0.002)
 
 
 @pytest.mark.slow

@@ -72,8 +72,8 @@ class NoiseReport:
 def json_value(value: Any) -> Any:
     """Return a value for JSON: data classes as objects, arrays as lists, and NaN as null.
 
-    >>> json_value({"a": np.array([1.5, np.nan]), "b": VarianceLaw(1, 2, 3, 4)})
-    {'a': [1.5, None], 'b': {'a': 1, 'b': 2, 'a_error': 3, 'b_error': 4}}
+    >>> json_value({"a": np.array([1.5, np.nan]), "b": (1, None)})
+    {'a': [1.5, None], 'b': [1, None]}
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
