@@ -12,7 +12,7 @@ from clpipe.analysis.calibration.dark_figures import (
     dark_figures,
     slope_and_offset,
 )
-from clpipe.analysis.calibration.fixed_pattern import Pixels
+from clpipe.analysis.calibration.fixed_pattern import NO_PIXELS
 from clpipe.analysis.calibration.groups import by_time
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.profile import calibrated_profile
@@ -22,7 +22,6 @@ from clpipe.pipeline import Pipeline
 
 UNIT = 16383 - 512
 READ = 3.0  # DN
-NO_PIXELS = Pixels(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 1.0)
 
 
 def dark_frames(count, shape=(225, 259), pattern="RGGB", iso=800, light=0.0, **stages):

@@ -50,7 +50,15 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
             not repeats of one scene.
         ImageError: there are no valid pixels.
     """
-    noise = NoiseOf.images(images, truth)
+    return report_of(images, truth, NoiseOf.images(images, truth))
+
+
+def report_of(images: Sequence[Picture], truth: Picture | None, noise: "NoiseOf") -> NoiseReport:
+    """Return the report on the noise of images.
+
+    Raises:
+        ImageError: there are no valid pixels.
+    """
     first = images[0]
     if not noise.start.any():
         raise no_valid_samples(first)

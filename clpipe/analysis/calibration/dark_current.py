@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from clpipe.analysis.calibration.dark_figures import without_rows
+from clpipe.analysis.calibration.fixed_pattern import NO_PIXELS, dark_pattern
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.analysis.report import json_object
 from clpipe.base.types import Doubles, Floats
-from clpipe.reference.cfa import sites
 
 MIN_TIMES = 2
 
@@ -82,16 +82,10 @@ def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
     in_time = float(of_pixels.mean())
     freedom = of_pixels.size * (count - 1)
     scatter = float(of_pixels.std()) / of_pixels.size**0.5
-    flat = mean.copy()
-    for site in sites(sensor.bayer).values():
-        part = flat[site]
-        part -= part.mean(axis=0, keepdims=True)
-        part -= part.mean(axis=1, keepdims=True)
-    squares = flat**2
-    pattern = float(squares.mean()) - in_time / count
-    error = float(squares.std()) / squares.size**0.5
+    left = Estimate(in_time / count, 0.0)
+    _, pattern = dark_pattern(mean, left, NO_PIXELS, sensor)
     least = in_time * (2 / freedom) ** 0.5
-    return Estimate(in_time, max(scatter, least)), Estimate(pattern, error)
+    return Estimate(in_time, max(scatter, least)), pattern
 
 
 def slope_of(x: Doubles, estimates: tuple[Estimate, ...]) -> Estimate:

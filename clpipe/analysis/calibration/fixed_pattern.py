@@ -44,6 +44,9 @@ class Pixels:
         return {"positions": at, "excess_dn": np.round(self.excess, 2).tolist()}
 
 
+NO_PIXELS = Pixels(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 1.0)
+
+
 def _pixels(mask: Array, excess: Array, seen_on: float) -> Pixels:
     """Return the pixels where a mask is True."""
     rows, columns = np.nonzero(mask)
