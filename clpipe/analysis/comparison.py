@@ -215,7 +215,7 @@ def _against_truth(picture: Picture, truth: Picture) -> Noise:
         return Noise(0.0, 0.0, np.nan)
     (light,) = (one for one in measure([picture], truth).channels if one.name == "Y")
     rms = float(np.sqrt(np.square(picture.pixels - truth.pixels).mean(dtype=np.float64)))
-    return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left)
+    return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left_2x2)
 
 
 def _flat_noise(picture: Picture, place: Crop) -> Noise:

@@ -5,13 +5,14 @@ unit, and ``mask`` (height, width), which is True for valid pixels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.types import Doubles, Floats, Mask
 
+NOT_IN_JSON = {"json": False}  # metadata of fields that reports omit
 BINS = 24
 MIN_SAMPLES = 100  # samples in a bin, for which the standard error of sigma is 7 %
 
@@ -20,11 +21,11 @@ MIN_SAMPLES = 100  # samples in a bin, for which the standard error of sigma is 
 class NoiseCurve:
     """Noise by intensity: one value for each bin with enough samples, in ascending order."""
 
-    bins: NDArray[np.int64]  # the numbers of the bins
     mean: Doubles  # mean intensity
-    shift: Doubles  # the mean of the noise
     sigma: Doubles  # the standard deviation of the noise about the shift
-    count: NDArray[np.int64]  # number of samples
+    shift: Doubles  # the mean of the noise
+    samples: NDArray[np.int64]  # their number
+    bins: NDArray[np.int64] = field(metadata=NOT_IN_JSON)  # the numbers of the bins
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def noise_by_intensity(
     if spread and bins > 1:
         error = np.sqrt(spread * np.interp(edges[1:-1], mean, sigma**2))
         mean = mean + (_selection_bias(values, edges, error) * len(noise))[used] / count[used]
-    curve = NoiseCurve(used, mean, shift, sigma, count[used])
+    curve = NoiseCurve(mean, sigma, shift, count[used], used)
     without = np.zeros(noise.shape, np.float32)
     without[:, mask] = samples
     here = np.sqrt(np.interp(values, mean, sigma**2))
@@ -134,7 +135,7 @@ def _selection_bias(values: Doubles, edges: Doubles, error: Doubles) -> Doubles:
 def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
     """Return the curve of several channels together; all curves have the same edges."""
     bins, place = np.unique(np.concatenate([c.bins for c in curves]), return_inverse=True)
-    count = np.concatenate([c.count for c in curves])
+    count = np.concatenate([c.samples for c in curves])
     total = np.bincount(place, count)
 
     def weighted_mean(values: Sequence[Doubles]) -> Doubles:
@@ -143,7 +144,7 @@ def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
     variance = weighted_mean([c.sigma**2 for c in curves])
     mean = weighted_mean([c.mean for c in curves])
     shift = weighted_mean([c.shift for c in curves])
-    return NoiseCurve(bins, mean, shift, np.sqrt(variance), total.astype(np.int64))
+    return NoiseCurve(mean, np.sqrt(variance), shift, total.astype(np.int64), bins)
 
 
 def fit_variance(curve: NoiseCurve, independent: float = 1.0) -> VarianceLaw | None:
@@ -163,7 +164,7 @@ def fit_variance(curve: NoiseCurve, independent: float = 1.0) -> VarianceLaw | N
     """
     if len(curve.mean) < 2 or not curve.sigma.any():
         return None
-    variance, count = curve.sigma**2, curve.count * independent
+    variance, count = curve.sigma**2, curve.samples * independent
     terms = np.stack([curve.mean, np.ones_like(curve.mean)], axis=1)
     expected = np.full_like(variance, np.average(variance, weights=count))
     for _ in range(10):

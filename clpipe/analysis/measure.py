@@ -27,7 +27,7 @@ from clpipe.reference.colour import luma, rgb_to_ycbcr
 from clpipe.stage import Kind
 
 # The share of valid pixels, the channels, the correlations of pairs of channels, and covariances.
-Parts = tuple[float, list[Channel], dict[tuple[str, str], float], dict[str, Doubles]]
+Parts = tuple[float, list[Channel], dict[str, float], dict[str, Doubles]]
 
 CORRELATED = 4  # sites of a mosaic; if there are more, not all pairs are correlated
 
@@ -76,16 +76,16 @@ def report_of(images: Sequence[Picture], truth: Picture | None, noise: "NoiseOf"
         truth=str(truth.path) if truth else None,
         width=noise.clean.shape[1],
         height=noise.clean.shape[0],
-        share=share,
+        share_used=share,
         edges=edges,
         channels=tuple(channels),
-        correlations=correlations,
-        covariances=covariances,
+        correlation=correlations,
+        covariance=covariances,
         notes=tuple(notes_on(images, truth, noise.noise)),
         iso=next((image.iso for image in images if image.iso), None),
-        at_edges=math.nan if is_mosaic else at_edges(noise),
+        edges_over_flat=math.nan if is_mosaic else at_edges(noise),
         finished=finished(images, truth),
-        rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
+        rounding_variance=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
 
 
@@ -245,11 +245,11 @@ def picture_channels(first: Picture, measured: NoiseOf, edges: Doubles) -> Parts
         if name in Kind.RGB.channels:
             flat.append(centred[:, mask])
             curve, *_ = measured.by_intensity(plane, own, np.ones_like(mask), edges)
-            channel = replace(channel, whole_curve=curve)
+            channel = replace(channel, intensity_picture=curve)
         channels.append(channel)
         standards[name] = standard
     both = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
-    correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in both}
+    correlations = {f"{a}-{b}": correlation(standards[a], standards[b], mask) for a, b in both}
     samples = np.stack(flat, axis=-1)[:, None]
     areas = {FLAT: samples, PICTURE: noise, HALVED: halved(noise)}
     covariances = {where: covariance(own) for where, own in areas.items()}
@@ -282,9 +282,9 @@ def mosaic_channels(first: Picture, measured: NoiseOf, edges: Doubles) -> Parts:
         curve, centred[at], standard[at] = measured.by_intensity(clean[at], noise[at], mask, edges)
         whole_mask[at] = mask
         add(name, curve, at)
-    add(WHOLE, pool_curves([channel.curve for channel in channels]), np.s_[...])
+    add(WHOLE, pool_curves([channel.intensity for channel in channels]), np.s_[...])
     correlations = {}
     for a, b in combinations(slices if len(slices) <= CORRELATED else (), 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]
-        correlations[a, b] = correlation(standard[slices[a]], standard[slices[b]], both)
+        correlations[f"{a}-{b}"] = correlation(standard[slices[a]], standard[slices[b]], both)
     return float(whole_mask.mean()), channels, correlations, {}

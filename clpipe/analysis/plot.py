@@ -39,7 +39,7 @@ def draw(report: NoiseReport, path: Path) -> None:
     first, *more = report.images
     subject = short_name(first) + (f" and {len(more)} more" if more else "")
     against = short_name(report.truth) if report.truth else "their mean"
-    title = f"Noise of {subject} against {against} ({report.kind}, {report.share:.0%} used)"
+    title = f"Noise of {subject} against {against} ({report.kind}, {report.share_used:.0%} used)"
 
     def draw_page(figure: Figure) -> None:
         above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.15, 1)).ravel()
@@ -92,7 +92,7 @@ def law_svg(report: NoiseReport, a: float, b: float, title: str) -> str:
         b: b in squared signal units.
         title: a description for screen readers.
     """
-    curves = {one.name: one.curve for one in report.channels if one.name != "mosaic"}
+    curves = {one.name: one.intensity for one in report.channels if one.name != "mosaic"}
     sites = [
         Series(curve.mean, curve.sigma**2, INK[name], name, "o", markersize=4)
         for name, curve in curves.items()
@@ -144,7 +144,7 @@ def intensity_panel(report: NoiseReport) -> Panel:
     """Return sigma over intensity, and the fitted sqrt(a*y + b) if there is one."""
     series = []
     for one in report.channels:
-        ink, curve, law = INK[one.name], one.curve, one.law
+        ink, curve, law = INK[one.name], one.intensity, one.law
         style = "o" if law else "--o" if one.name in ("Y", "Cb", "Cr") else "-o"
         series.append(Series(curve.mean, curve.sigma, ink, one.name, style, markersize=5))
         if law:
@@ -160,21 +160,21 @@ def tails_panel(report: NoiseReport) -> Panel:
     beyond = [gaussian_beyond(abs(z)) / 2 for z in HISTOGRAM]
     series = [Series(HISTOGRAM, beyond, "0.85", "Gaussian", AREA, y2=1e-12)]
     for one in report.channels:
-        below = np.concatenate([[0], np.cumsum(one.tails.histogram)]) / one.count
+        below = np.concatenate([[0], np.cumsum(one.tails.histogram)]) / one.samples
         share = np.minimum(below, 1 - below)
-        known = np.where(share * one.count > 0.5, share, np.nan)
+        known = np.where(share * one.samples > 0.5, share, np.nan)
         series.append(Series(HISTOGRAM, known, INK[one.name], one.name, linewidth=1.5))
     texts = "Tails", "noise / its sigma at that intensity", "share of samples further out"
-    ends = 0.3 / max(one.count for one in report.channels), 0.7
+    ends = 0.3 / max(one.samples for one in report.channels), 0.7
     return Panel(series, *texts, yscale="log", ylim=ends, xlim=(-6, 6))
 
 
 def correlations_panel(report: NoiseReport) -> Panel:
     """Return the correlations of red, green and blue; without them, of all pairs of channels."""
-    pairs = [pair for pair in report.correlations if set(pair) <= {"R", "G", "B"}]
-    pairs = pairs or list(report.correlations)
-    values = [float(np.nan_to_num(report.correlations[pair])) for pair in pairs]
-    bars = Series(values, ["-".join(pair) for pair in pairs], VIOLET, style=BARS)
+    pairs = [pair for pair in report.correlation if set(pair) <= set("RGB-")]
+    pairs = pairs or list(report.correlation)
+    values = [float(np.nan_to_num(report.correlation[pair])) for pair in pairs]
+    bars = Series(values, pairs, VIOLET, style=BARS)
     return Panel([bars], "correlation between channels", xlim=(min(0, *values), 1))
 
 
@@ -185,7 +185,7 @@ def draw_autocorrelation(axes: Axes, one: Channel, limit: float, report: NoiseRe
     extent = (-LAGS - 0.5, LAGS + 0.5, LAGS + 0.5, -LAGS - 0.5)
     picture = axes.imshow(table, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent)
     axes.grid(visible=False)
-    axes.set_title(f"{one.name}: left after 2x2: {one.energy_left:.3f}")
+    axes.set_title(f"{one.name}: left after 2x2: {one.energy_left_2x2:.3f}")
     per_site = report.kind not in MAPS and one.name != "mosaic"
     axes.set_xlabel("lag right, pixels" + (" of this site" if per_site else ""))
     axes.set_ylabel("lag down")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.intensity import NoiseCurve
+from clpipe.analysis.intensity import NOT_IN_JSON
 from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
 from clpipe.base.types import Doubles
 
@@ -20,57 +20,45 @@ UNITS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NoiseReport:
     """The measured noise of some images, channel by channel."""
 
     kind: str
+    iso: float | None = None  # None if the images do not state it
+    bursts: int = 1  # number of bursts whose noise is pooled
+    rounding_variance: float = 0.0  # that rounding in files adds to each channel
     images: tuple[str, ...]
     truth: str | None  # None: the mean of the images
     width: int
     height: int
-    share: float  # share of valid pixels, or of valid samples in a mosaic
-    edges: Doubles  # edges of the intensity bins
-    channels: tuple[Channel, ...]
-    correlations: Mapping[tuple[str, str], float]
-    covariances: Mapping[str, Doubles]  # RGB covariance matrices, (3, 3), by area; {} for mosaics
+    share_used: float  # share of valid pixels, or of valid samples in a mosaic
     notes: tuple[str, ...]
-    iso: float | None = None  # None if the images do not state it
-    bursts: int = 1  # number of bursts whose noise is pooled
+    channels: tuple[Channel, ...]
     # RMS of luma noise at edges relative to flat areas; only for pictures.
-    at_edges: float = math.nan
+    edges_over_flat: float = math.nan
     finished: Mapping[str, float] = field(default_factory=dict)  # see clpipe.analysis.finished
-    rounding: float = 0.0  # the variance that rounding in files adds to each channel
+    covariance: Mapping[str, Doubles]  # RGB covariance matrices, (3, 3), by area; {} for mosaics
+    correlation: Mapping[str, float]  # of two channels, such as "R-G"
     frames: int = 0  # the number of frames of a clip; 0 for images
     # The correlation with frames 1, 2 and more later, by channel; only for clips.
-    temporal: Mapping[str, Doubles] = field(default_factory=dict)
+    temporal_correlation: Mapping[str, Doubles] = field(default_factory=dict)
+    edges: Doubles = field(metadata=NOT_IN_JSON)  # edges of the intensity bins
 
     def record(self) -> dict[str, Any]:
         """Return the report as JSON values; unknown values are null."""
-        return json_object(
-            kind=self.kind,
-            unit=UNITS[self.kind],
-            iso=self.iso,
-            bursts=self.bursts,
-            rounding_variance=self.rounding,
-            images=self.images,
-            truth=self.truth,
-            width=self.width,
-            height=self.height,
-            share_used=self.share,
-            notes=self.notes,
-            channels={channel.name: channel_record(channel) for channel in self.channels},
-            edges_over_flat=self.at_edges,
-            finished=self.finished,
-            covariance=self.covariances,
-            correlation={f"{a}-{b}": r for (a, b), r in self.correlations.items()},
-            frames=self.frames,
-            temporal_correlation=self.temporal,
+        channels = {channel.name: channel_record(channel) for channel in self.channels}
+        return (
+            {"kind": self.kind, "unit": UNITS[self.kind]}
+            | json_value(self)
+            | {"channels": channels}
         )
 
 
 def json_value(value: Any) -> Any:
     """Return a value for JSON: data classes as objects, arrays as lists, and NaN as null.
+
+    Fields with the metadata NOT_IN_JSON are omitted.
 
     >>> json_value({"a": np.array([1.5, np.nan]), "b": (1, None)})
     {'a': [1.5, None], 'b': [1, None]}
@@ -78,7 +66,8 @@ def json_value(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if is_dataclass(value):
-        value = {each.name: getattr(value, each.name) for each in fields(value)}
+        names = (each.name for each in fields(value) if each.metadata != NOT_IN_JSON)
+        value = {name: getattr(value, name) for name in names}
     if isinstance(value, Mapping):
         return {str(key): json_value(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -91,29 +80,10 @@ def json_object(**values: Any) -> dict[str, Any]:
     return {name: json_value(value) for name, value in values.items()}
 
 
-def curve_record(curve: NoiseCurve | None) -> dict[str, Any] | None:
-    """Noise by intensity as JSON values."""
-    return (
-        None
-        if curve is None
-        else json_object(mean=curve.mean, sigma=curve.sigma, shift=curve.shift, samples=curve.count)
-    )
-
-
 def channel_record(channel: Channel) -> dict[str, Any]:
     """Return a channel as JSON values."""
-    tails = channel.tails
-    return json_object(
-        samples=channel.count,
-        sigma=channel.sigma,
-        sigma_picture=channel.whole_sigma,
-        law=channel.law,
-        intensity=curve_record(channel.curve),
-        intensity_picture=curve_record(channel.whole_curve),
-        row=channel.rows,
-        column=channel.columns,
-        autocorrelation=channel.autocorrelation,
-        energy_left_2x2=channel.energy_left,
+    tails, found = channel.tails, json_value(channel)
+    return found | json_object(
         skewness=tails.skewness,
         excess_kurtosis=tails.excess_kurtosis,
         beyond=dict(zip(SIGMAS, tails.beyond, strict=True)),

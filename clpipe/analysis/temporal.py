@@ -66,7 +66,7 @@ def measure_clip(path: Path) -> NoiseReport:
     planes = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)[:, flat]
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     temporal = {name: temporal_correlation(planes[..., c]) for c, name in enumerate(names)}
-    return replace(report, images=(str(path),), frames=len(pictures), temporal=temporal)
+    return replace(report, images=(str(path),), frames=len(pictures), temporal_correlation=temporal)
 
 
 def temporal_correlation(noise: Floats, lags: int = LAGS) -> Doubles:

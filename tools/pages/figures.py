@@ -215,14 +215,16 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
     sheet = Figure(figsize=(7.5, 6), layout="constrained")
     sheet.suptitle(title, fontsize=10)
     (of_raw, of_picture), (lags, spectrum) = sheet.subplots(2, 2)
-    of_raw.plot(raw.curve.mean, raw.curve.sigma, "o", color="black", markersize=4, label="measured")
+    of_raw.plot(
+        raw.intensity.mean, raw.intensity.sigma, "o", color="black", markersize=4, label="measured"
+    )
     if raw.law:
-        y = np.linspace(0, raw.curve.mean[-1], 200)
+        y = np.linspace(0, raw.intensity.mean[-1], 200)
         law = f"√(a y + b), a = {raw.law.a:.3g}, b = {raw.law.b:.2g}"
         of_raw.plot(y, np.sqrt(np.maximum(raw.law.a * y + raw.law.b, 0)), color="black", label=law)
     caption(of_raw, "Raw: noise by intensity", "signal, 1 = white level", "sigma")
     for label, one in found.items():
-        curve, table = one.curve, one.autocorrelation
+        curve, table = one.intensity, one.autocorrelation
         of_picture.plot(curve.mean * LEVELS, curve.sigma * LEVELS, "o-", markersize=3, label=label)
         lags.plot(range(LAGS + 1), table[LAGS, LAGS:], "o-", markersize=3, label=label)
         near = slice(LAGS - MAX_LAG, LAGS + MAX_LAG + 1)
