@@ -32,9 +32,6 @@ TINY = 1e-9  # DN^2
 WIDTH_OF_KNOTS = 0.96
 
 
-FourEstimates = tuple[Estimate, Estimate, Estimate, Estimate]
-
-
 @dataclass(frozen=True)
 class Wave:
     """A wave over the rows."""
@@ -61,7 +58,7 @@ class Shading:
 class DarkFigures:
     """Figures of dark frames in DN; None if there are too few frames."""
 
-    color_bias: FourEstimates  # R, G in rows with R, G in rows with B, and B
+    color_bias: tuple[Estimate, ...]  # R, G in rows with R, G in rows with B, and B
     black_level_error: Estimate | None
     tukey_lambda: Estimate | None
     banding: Wave | None
@@ -117,14 +114,13 @@ def without_rows(rest: Floats) -> Floats:
     return own
 
 
-def bias_of(levels: Doubles, own: Floats, black: float) -> FourEstimates:
+def bias_of(levels: Doubles, own: Floats, black: float) -> tuple[Estimate, ...]:
     """Return the mean errors of the four levels in DN, from (frame, 4) levels."""
     frames = len(levels)
     pixels = float(own.var() or 1.0) / own[0].size * 4
     errors = levels.std(axis=0, ddof=1) / frames**0.5 if frames > 1 else [pixels**0.5] * 4
     pairs = zip(levels.mean(axis=0) - black, errors, strict=True)
-    one, two, three, four = (Estimate(float(value), float(error)) for value, error in pairs)
-    return one, two, three, four
+    return tuple(Estimate(float(value), float(error)) for value, error in pairs)
 
 
 def scatter(levels: Doubles, rest: Floats, own_sites: Sequence[tuple[slice, slice]]) -> Estimate:

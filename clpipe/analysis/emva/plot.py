@@ -29,8 +29,10 @@ def emva_png(moments: Moments, figures: Figures, title: str) -> bytes:
     They are sensitivity, photon transfer, signal-to-noise ratio, linearity,
     spectrograms of rows and of columns, and histograms of DSNU and PRNU.
     """
-    each = (_sensitivity, _photon_transfer, _signal_to_noise, _linearity, _rows, _columns)
-    panels = [panel(moments, figures) for panel in (*each, _dsnu, _prnu)]
+    of_light = (_sensitivity, _photon_transfer, _signal_to_noise, _linearity)
+    panels = [panel(moments, figures) for panel in of_light]
+    panels += [_spectra(moments, figures, across) for across in (False, True)]
+    panels += [_dsnu(moments, figures), _prnu(moments, figures)]
     return page_png(20, title, lambda figure: draw_grid(figure, panels, 2))
 
 
@@ -92,14 +94,6 @@ def _linearity(moments: Moments, figures: Figures) -> Panel:
         Series(None, 0, BLACK, lw=1.2),
     ]
     return Panel(series, "Linearity", PHOTONS, "off the line, %")
-
-
-def _rows(moments: Moments, figures: Figures) -> Panel:
-    return _spectra(moments, figures, across=False)
-
-
-def _columns(moments: Moments, figures: Figures) -> Panel:
-    return _spectra(moments, figures, across=True)
 
 
 def _spectra(moments: Moments, figures: Figures, across: bool) -> Panel:
