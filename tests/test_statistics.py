@@ -5,8 +5,13 @@ from math import erfc, sqrt
 import numpy as np
 import pytest
 
-from clpipe.analysis.intensity import bin_edges, fit_variance, noise_by_intensity, pool_curves
-from clpipe.analysis.selection import select_unclipped
+from clpipe.analysis.intensity import (
+    bin_edges,
+    fit_variance,
+    noise_by_intensity,
+    pool_curves,
+    select_unclipped,
+)
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs, energy_left, line_noise
 from clpipe.analysis.statistics import SIGMAS, channel_statistics, correlation, tails
 from clpipe.outputs.noise_areas import select_flat

@@ -1,7 +1,7 @@
 """Chooses crops of a picture: given by the user, or found automatically."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,9 +95,8 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
 
 def flat(picture: Floats) -> Doubles:
     """Score flat places: low variance of R, G and B, at a medium brightness."""
-    variance = np.asarray(
-        sum(window_means(plane**2) - window_means(plane) ** 2 for plane in _planes(picture))
-    )
+    planes = np.moveaxis(picture.astype(np.float64), -1, 0)
+    variance = np.sum([window_means(p**2) - window_means(p) ** 2 for p in planes], axis=0)
     light = window_means(luma(picture))
     low, high = MIDDLE
     return _only(-variance, (low <= light) & (light <= high))
@@ -153,10 +152,6 @@ def window_means(plane: Doubles | Mask) -> Doubles:
     total = np.pad(plane.cumsum(0, np.float64).cumsum(1), ((1, 0), (1, 0)))
     rows = total[HEIGHT:] - total[:-HEIGHT]
     return np.asarray((rows[:, WIDTH:] - rows[:, :-WIDTH]) / (HEIGHT * WIDTH))
-
-
-def _planes(picture: Floats) -> Iterator[Doubles]:
-    return (picture[..., channel].astype(np.float64) for channel in range(3))
 
 
 def _only(score: Doubles, allowed: Mask) -> Doubles:

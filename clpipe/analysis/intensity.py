@@ -16,6 +16,10 @@ NOT_IN_JSON = {"json": False}  # metadata of fields that reports omit
 BINS = 24
 MIN_SAMPLES = 100  # samples in a bin, for which the standard error of sigma is 7 %
 
+# Statistics of a bin are distorted if more than this share of its samples are clipped. We chose the
+# value; tests/test_statistics.py shows its effect.
+CLIPPED = 1e-3
+
 
 @dataclass(frozen=True)
 class NoiseCurve:
@@ -59,6 +63,27 @@ def bin_of(intensity: Floats, edges: Doubles) -> NDArray[np.int64]:
     [0, 4, 23]
     """
     return np.clip(np.searchsorted(edges, intensity, "right") - 1, 0, len(edges) - 2)
+
+
+def select_unclipped(intensity: Floats, clipped: Mask, edges: Doubles, start: Mask) -> Mask:
+    """Return the pixels of ``start`` at intensities where clipping does not distort the noise.
+
+    Excluding only clipped samples would leave a one-sided distribution. Therefore an intensity bin
+    is excluded if more than :data:`CLIPPED` of its samples are clipped. In other bins, each pixel
+    that is clipped in any frame is excluded.
+
+    Args:
+        intensity: (height, width).
+        clipped: True for clipped samples, (frame, height, width).
+        edges: edges of the intensity bins.
+        start: the pixels to select from, (height, width).
+    """
+    index = bin_of(intensity, edges)
+    size = len(edges) - 1
+    count = np.bincount(index[start], minlength=size)
+    lost = np.bincount(index[start], clipped.mean(0)[start], minlength=size)
+    whole = lost <= CLIPPED * count
+    return start & whole[index] & ~clipped.any(0)
 
 
 def noise_by_intensity(

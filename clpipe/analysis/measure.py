@@ -10,12 +10,17 @@ import numpy as np
 
 from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.finished import finished_figures
-from clpipe.analysis.intensity import NoiseCurve, bin_edges, noise_by_intensity, pool_curves
+from clpipe.analysis.intensity import (
+    NoiseCurve,
+    bin_edges,
+    noise_by_intensity,
+    pool_curves,
+    select_unclipped,
+)
 from clpipe.analysis.matching.columns import Figures
 from clpipe.analysis.pictures import WHOLE, Picture
 from clpipe.analysis.repeats import check_repeats
 from clpipe.analysis.report import NoiseReport
-from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import count_pairs
 from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
@@ -37,7 +42,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
 
     Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). Noise that all
     frames share, such as column noise, is part of the mean and is not measured. Clipped intensities
-    are ignored, see :func:`clpipe.analysis.selection.select_unclipped`. In pictures, only flat
+    are ignored, see :func:`clpipe.analysis.intensity.select_unclipped`. In pictures, only flat
     areas are measured, see :func:`clpipe.outputs.noise_areas.select_flat`. The whole sigma, and the
     covariances of the whole picture before and after averaging 2x2, include every pixel.
 

@@ -159,22 +159,16 @@ def measure_heading(report: NoiseReport) -> str:
     at = f", ISO {report.iso:g}" if report.iso else ""
     unit_text = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
     count = report.frames or len(report.images)
+    ratio = f"{report.edges_over_flat:.2f} times"
+    edges = f"luma noise is {ratio} as strong at edges (steepest tenth) as in the flattest quarter"
     lines = [
         f"{count} x {report.kind}{of}, {report.width}x{report.height}{at}, against {against}; "
         f"unit: {UNITS[report.kind]}",
         f"{report.share_used:.1%} of the {unit_text} are used; sigma (all) uses every one",
-        *edges_text(report),
+        *([] if math.isnan(report.edges_over_flat) else [edges]),
         *(f"note: {note}" for note in report.notes),
     ]
     return "\n".join(lines)
-
-
-def edges_text(report: NoiseReport) -> list[str]:
-    """Return how much stronger the noise of pictures is at edges, or [] for other images."""
-    if math.isnan(report.edges_over_flat):
-        return []
-    ratio = f"{report.edges_over_flat:.2f} times"
-    return [f"luma noise is {ratio} as strong at edges (steepest tenth) as in the flattest quarter"]
 
 
 def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:

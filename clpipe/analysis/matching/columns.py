@@ -29,13 +29,7 @@ from clpipe.reference.colour import LUMA, luma, rgb_to_ycbcr
 
 MAX_LAG = 6  # px, the longest lag
 # Cycles per pixel; the edges of bands. The corner of the spectrum is at 0.71.
-BANDS = (
-    0.0,
-    0.125,
-    0.25,
-    0.375,
-    0.75,
-)
+BANDS = 0.0, 0.125, 0.25, 0.375, 0.75
 LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # edges of the luma bins
 RELATIVE_TO = 64  # the luma bin to which noise by intensity is relative, between cameras
 BLOCK = 32  # px; the side of a block
@@ -239,8 +233,8 @@ def flat_places(mean: Array, mask: Mask | None = None) -> ValidPixels:
     return ValidPixels(mask, luma(mean), saturated=saturated_of(mean, mask))
 
 
-LAGS = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
-LAGS["two_below"] = (2, 0)
+LAGS = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1)}
+LAGS |= {"two_right": (0, 2), "two_below": (2, 0)}
 LONG_LAGS_RIGHT = {f"right_{lag}": (0, lag) for lag in LONG_LAGS}
 LAGS |= LONG_LAGS_RIGHT
 
