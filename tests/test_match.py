@@ -109,7 +109,7 @@ def test_independent_noise(grey):
     rings = [np.pi * (k / 8) ** 2 for k in (1, 2, 3)]
     shares = [rings[0], rings[1] - rings[0], rings[2] - rings[1], 1 - rings[2]]
     assert [found[f"band_{k}"] for k in (1, 2, 3, 4)] == pytest.approx(shares, abs=0.03)
-    assert found["sigma_96"] == pytest.approx(found["rms"])
+    assert found["sigma_128"] == pytest.approx(found["rms"])
     assert np.isnan(found["sigma_12"])
     # The relative standard error of the rms of n independent samples is 1 / sqrt(2 n).
     error = errors_of(noise, places)["rms"] / found["rms"]
