@@ -295,14 +295,6 @@ def test_frames_that_cannot_tell_are_refused():
 
 
 @pytest.mark.slow
-def test_a_single_image():
-    found = calibrate(100, frames(scene(384, 512), 1, 0.5, 3.0), None, SENSOR)
-    assert off(found.pooled.gain, 0.5)[0] < 0.06
-    assert off(found.read_noise, 3.0)[0] < 0.15
-    assert found.row_noise is None and found.hot is None
-
-
-@pytest.mark.slow
 def test_a_single_image_with_dark_frames():
     dark = frames(scene(384, 512) * 0, 4, 5.0, 5.3, row=2.65, seed=2)
     found = calibrate(100, frames(scene(384, 512), 1, 5.0, 5.3), dark, SENSOR)

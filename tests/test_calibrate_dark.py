@@ -10,22 +10,18 @@ from clpipe.analysis.calibration.dark_current import dark_current
 from clpipe.analysis.calibration.dark_figures import (
     Shading,
     dark_figures,
-    l_kurtosis,
-    sites_of,
     slope_and_offset,
 )
-from clpipe.analysis.calibration.fixed_pattern import Pixels
+from clpipe.analysis.calibration.fixed_pattern import NO_PIXELS
 from clpipe.analysis.calibration.groups import by_time
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.profile import calibrated_profile
 from clpipe.analysis.calibration.repeats import Sensor
 from clpipe.camera.profile import parse_camera
 from clpipe.pipeline import Pipeline
-from clpipe.reference.cfa import PATTERNS
 
 UNIT = 16383 - 512
 READ = 3.0  # DN
-NO_PIXELS = Pixels(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 1.0)
 
 
 def dark_frames(count, shape=(225, 259), pattern="RGGB", iso=800, light=0.0, **stages):
@@ -75,12 +71,6 @@ def test_the_shape_of_read_noise(shape, frames):
     assert found is not None
     assert within(found, shape, 5.0)
     assert found.error < 0.03
-
-
-def test_gaussian_noise_has_its_l_kurtosis():
-    normal = np.random.default_rng(0).normal(size=1_000_000)
-    assert l_kurtosis(normal) == pytest.approx(0.1226, abs=0.001)
-    assert l_kurtosis(np.random.default_rng(0).random(1_000_000)) == pytest.approx(0, abs=0.002)
 
 
 @pytest.mark.slow
@@ -195,14 +185,6 @@ def test_dark_frames_are_grouped_by_their_times():
     assert names(2.0) == [[3], [4], [1], [0, 2]]
     assert names(None) == [[4], [1], [3], [0, 2]]
     assert by_time([], 1.0) == [()]
-
-
-def test_sites_of_every_pattern():
-    for pattern in PATTERNS:
-        frame = np.array(list(pattern)).reshape(2, 2)
-        assert [frame[site][0, 0] for site in sites_of(pattern)] == ["R", "G", "G", "B"]
-        (red_row, _), (green_row, _) = sites_of(pattern)[:2]
-        assert red_row == green_row
 
 
 def test_one_iso_gives_an_offset_alone():

@@ -5,8 +5,13 @@ from math import erfc, sqrt
 import numpy as np
 import pytest
 
-from clpipe.analysis.intensity import bin_edges, fit_variance, noise_by_intensity, pool_curves
-from clpipe.analysis.selection import select_unclipped
+from clpipe.analysis.intensity import (
+    bin_edges,
+    fit_variance,
+    noise_by_intensity,
+    pool_curves,
+    select_unclipped,
+)
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs, energy_left, line_noise
 from clpipe.analysis.statistics import SIGMAS, channel_statistics, correlation, tails
 from clpipe.outputs.noise_areas import select_flat
@@ -84,7 +89,7 @@ def test_the_law_of_a_sensor_is_recovered():
     assert abs(law.b - b) < 3 * law.b_error < 0.05 * b
     assert curve.sigma == pytest.approx(np.sqrt(a * curve.mean + b), rel=0.03)
     assert curve.shift == pytest.approx(0.01 * curve.mean**2, abs=4e-4)
-    assert curve.count.sum() == noise.size
+    assert curve.samples.sum() == noise.size
     assert abs(tails(standard, ALL).excess_kurtosis) < 0.02
     assert without.std() == pytest.approx(sqrt(a / 2 + b), rel=0.01)
 
@@ -165,6 +170,6 @@ def test_pooled_curves():
     whole, *_ = noise_by_intensity(RAMP, noise, ALL, EDGES)
     halves = [noise_by_intensity(RAMP[i::2], noise[:, i::2], ALL[i::2], EDGES)[0] for i in (0, 1)]
     both = pool_curves(halves)
-    assert both.count.tolist() == whole.count.tolist()
+    assert both.samples.tolist() == whole.samples.tolist()
     assert both.mean == pytest.approx(whole.mean)
     assert both.sigma == pytest.approx(whole.sigma, rel=2e-3)

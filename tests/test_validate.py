@@ -9,10 +9,11 @@ from PIL import Image
 from scipy import ndimage
 
 from clpipe.analysis.matching.columns import ValidPixels, figures_of, noise_of_frames
-from clpipe.analysis.signature import flat_mask, luma
+from clpipe.analysis.signature import flat_mask
 from clpipe.camera.profile import load_camera
 from clpipe.images.read import read_image
 from clpipe.pipeline import Pipeline
+from clpipe.reference.colour import luma
 from clpipe.reference.transfer import srgb_curve
 from tools.pages import comparison_page, real_cameras, validate
 

@@ -22,17 +22,11 @@ def bursts_in(paths: Sequence[Path]) -> list[list[Path]]:
     Raises:
         RequestError: a folder has no pictures, or frames of several formats.
     """
-    bursts: list[list[Path]] = []
     files = [path for path in paths if not path.is_dir()]
-    frames = by_name(files)
-    if (
-        frames
-        and sum(map(len, frames.values())) == len(files)
-        and min(map(len, frames.values())) > 1
-    ):
-        bursts += frames.values()
-    elif files:
-        bursts.append(files)
+    bursts = [*by_name(files).values()]
+    are_bursts = sum(map(len, bursts)) == len(files) and min(map(len, bursts), default=2) > 1
+    if not are_bursts:
+        bursts = [files]
     for folder in (path for path in paths if path.is_dir()):
         bursts += bursts_below(folder)
     return bursts

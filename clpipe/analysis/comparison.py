@@ -1,7 +1,7 @@
 """Compares pictures of one scene: crops next to each other, differences, and noise."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,12 @@ import numpy as np
 from clpipe.analysis.crops import Crop, choose_crops
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
-from clpipe.analysis.report import json_number
-from clpipe.analysis.signature import luma
+from clpipe.analysis.report import json_object
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_line
 from clpipe.base.types import Doubles, Floats
+from clpipe.reference.colour import luma
 from clpipe.reference.transfer import srgb_curve
 
 LEVELS = 255  # sigmas are in 8-bit levels
@@ -59,13 +59,9 @@ class Comparison:
 
     def record(self) -> dict[str, Any]:
         """Return the figure's content without pixels, as JSON values; unknown numbers are None."""
-        noise = [{k: json_number(v) for k, v in asdict(each).items()} for each in self.noise]
-        return {
-            "labels": list(self.labels),
-            "places": [asdict(place) for place in self.places],
-            "noise": noise,
-            "notes": list(self.notes),
-        }
+        return json_object(
+            labels=self.labels, places=self.places, noise=self.noise, notes=self.notes
+        )
 
 
 def compare(
@@ -219,7 +215,7 @@ def _against_truth(picture: Picture, truth: Picture) -> Noise:
         return Noise(0.0, 0.0, np.nan)
     (light,) = (one for one in measure([picture], truth).channels if one.name == "Y")
     rms = float(np.sqrt(np.square(picture.pixels - truth.pixels).mean(dtype=np.float64)))
-    return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left)
+    return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left_2x2)
 
 
 def _flat_noise(picture: Picture, place: Crop) -> Noise:

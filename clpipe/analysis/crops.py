@@ -1,14 +1,14 @@
 """Chooses crops of a picture: given by the user, or found automatically."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.analysis.signature import luma
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.reference.colour import luma
 
 WIDTH, HEIGHT = 96, 64  # px; the size of an automatic crop
 SMOOTH = 5  # px: the window over which noise is averaged before the search
@@ -64,7 +64,7 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
     Crop(name='sky', left=10, top=20, width=30, height=40)
     """
     height, width = picture.shape[:2]
-    finder = _Finder(picture)
+    finder: _Finder | None = None
     places = []
     for text in texts or FOUND:
         if text in FOUND:
@@ -74,6 +74,7 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
                     f"needs {WIDTH}x{HEIGHT}; set the crop yourself, such as --crop "
                     f"0,0,{width}x{height}"
                 )
+            finder = finder or _Finder(picture)
             places.append(finder.find(text))
             continue
         match = MANUAL.fullmatch(text)
@@ -94,9 +95,8 @@ def choose_crops(texts: Sequence[str], picture: Floats) -> list[Crop]:
 
 def flat(picture: Floats) -> Doubles:
     """Score flat places: low variance of R, G and B, at a medium brightness."""
-    variance = np.asarray(
-        sum(window_means(plane**2) - window_means(plane) ** 2 for plane in _planes(picture))
-    )
+    planes = np.moveaxis(picture.astype(np.float64), -1, 0)
+    variance = np.sum([window_means(p**2) - window_means(p) ** 2 for p in planes], axis=0)
     light = window_means(luma(picture))
     low, high = MIDDLE
     return _only(-variance, (low <= light) & (light <= high))
@@ -128,17 +128,13 @@ class _Finder:
     """Finds crops in one picture that do not overlap earlier ones, if there is space."""
 
     def __init__(self, picture: Floats) -> None:
-        self._picture = picture
-        self._smooth: Floats | None = None
-        self._free: Mask | None = None
+        from scipy import ndimage
+
+        self._smooth: Floats = ndimage.uniform_filter(picture, (SMOOTH, SMOOTH, 1))
+        height, width = picture.shape[:2]
+        self._free = np.ones((height - HEIGHT + 1, width - WIDTH + 1), bool)
 
     def find(self, name: str) -> Crop:
-        if self._smooth is None or self._free is None:
-            from scipy import ndimage
-
-            self._smooth = ndimage.uniform_filter(self._picture, (SMOOTH, SMOOTH, 1))
-            height, width = self._picture.shape[:2]
-            self._free = np.ones((height - HEIGHT + 1, width - WIDTH + 1), bool)
         score = _only(FOUND[name](self._smooth), self._free)
         top, left = map(int, np.unravel_index(score.argmax(), score.shape))
         self._free[
@@ -153,13 +149,9 @@ def window_means(plane: Doubles | Mask) -> Doubles:
     >>> window_means(np.ones((65, 99))).shape
     (2, 4)
     """
-    total = np.pad(plane.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    total = np.pad(plane.cumsum(0, np.float64).cumsum(1), ((1, 0), (1, 0)))
     rows = total[HEIGHT:] - total[:-HEIGHT]
     return np.asarray((rows[:, WIDTH:] - rows[:, :-WIDTH]) / (HEIGHT * WIDTH))
-
-
-def _planes(picture: Floats) -> Iterator[Doubles]:
-    return (picture[..., channel].astype(np.float64) for channel in range(3))
 
 
 def _only(score: Doubles, allowed: Mask) -> Doubles:

@@ -5,26 +5,31 @@ unit, and ``mask`` (height, width), which is True for valid pixels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.types import Doubles, Floats, Mask
 
+NOT_IN_JSON = {"json": False}  # metadata of fields that reports omit
 BINS = 24
 MIN_SAMPLES = 100  # samples in a bin, for which the standard error of sigma is 7 %
+
+# Statistics of a bin are distorted if more than this share of its samples are clipped. We chose the
+# value; tests/test_statistics.py shows its effect.
+CLIPPED = 1e-3
 
 
 @dataclass(frozen=True)
 class NoiseCurve:
     """Noise by intensity: one value for each bin with enough samples, in ascending order."""
 
-    bins: NDArray[np.int64]  # the numbers of the bins
     mean: Doubles  # mean intensity
-    shift: Doubles  # the mean of the noise
     sigma: Doubles  # the standard deviation of the noise about the shift
-    count: NDArray[np.int64]  # number of samples
+    shift: Doubles  # the mean of the noise
+    samples: NDArray[np.int64]  # their number
+    bins: NDArray[np.int64] = field(metadata=NOT_IN_JSON)  # the numbers of the bins
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,27 @@ def bin_of(intensity: Floats, edges: Doubles) -> NDArray[np.int64]:
     [0, 4, 23]
     """
     return np.clip(np.searchsorted(edges, intensity, "right") - 1, 0, len(edges) - 2)
+
+
+def select_unclipped(intensity: Floats, clipped: Mask, edges: Doubles, start: Mask) -> Mask:
+    """Return the pixels of ``start`` at intensities where clipping does not distort the noise.
+
+    Excluding only clipped samples would leave a one-sided distribution. Therefore an intensity bin
+    is excluded if more than :data:`CLIPPED` of its samples are clipped. In other bins, each pixel
+    that is clipped in any frame is excluded.
+
+    Args:
+        intensity: (height, width).
+        clipped: True for clipped samples, (frame, height, width).
+        edges: edges of the intensity bins.
+        start: the pixels to select from, (height, width).
+    """
+    index = bin_of(intensity, edges)
+    size = len(edges) - 1
+    count = np.bincount(index[start], minlength=size)
+    lost = np.bincount(index[start], clipped.mean(0)[start], minlength=size)
+    whole = lost <= CLIPPED * count
+    return start & whole[index] & ~clipped.any(0)
 
 
 def noise_by_intensity(
@@ -100,7 +126,7 @@ def noise_by_intensity(
     if spread and bins > 1:
         error = np.sqrt(spread * np.interp(edges[1:-1], mean, sigma**2))
         mean = mean + (_selection_bias(values, edges, error) * len(noise))[used] / count[used]
-    curve = NoiseCurve(used, mean, shift, sigma, count[used])
+    curve = NoiseCurve(mean, sigma, shift, count[used], used)
     without = np.zeros(noise.shape, np.float32)
     without[:, mask] = samples
     here = np.sqrt(np.interp(values, mean, sigma**2))
@@ -134,7 +160,7 @@ def _selection_bias(values: Doubles, edges: Doubles, error: Doubles) -> Doubles:
 def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
     """Return the curve of several channels together; all curves have the same edges."""
     bins, place = np.unique(np.concatenate([c.bins for c in curves]), return_inverse=True)
-    count = np.concatenate([c.count for c in curves])
+    count = np.concatenate([c.samples for c in curves])
     total = np.bincount(place, count)
 
     def weighted_mean(values: Sequence[Doubles]) -> Doubles:
@@ -143,7 +169,7 @@ def pool_curves(curves: Sequence[NoiseCurve]) -> NoiseCurve:
     variance = weighted_mean([c.sigma**2 for c in curves])
     mean = weighted_mean([c.mean for c in curves])
     shift = weighted_mean([c.shift for c in curves])
-    return NoiseCurve(bins, mean, shift, np.sqrt(variance), total.astype(np.int64))
+    return NoiseCurve(mean, np.sqrt(variance), shift, total.astype(np.int64), bins)
 
 
 def fit_variance(curve: NoiseCurve, independent: float = 1.0) -> VarianceLaw | None:
@@ -163,7 +189,7 @@ def fit_variance(curve: NoiseCurve, independent: float = 1.0) -> VarianceLaw | N
     """
     if len(curve.mean) < 2 or not curve.sigma.any():
         return None
-    variance, count = curve.sigma**2, curve.count * independent
+    variance, count = curve.sigma**2, curve.samples * independent
     terms = np.stack([curve.mean, np.ones_like(curve.mean)], axis=1)
     expected = np.full_like(variance, np.average(variance, weights=count))
     for _ in range(10):

@@ -2,19 +2,25 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from clpipe.analysis.edges import slopes_of
 from clpipe.analysis.finished import finished_figures
-from clpipe.analysis.intensity import bin_edges, noise_by_intensity, pool_curves
+from clpipe.analysis.intensity import (
+    NoiseCurve,
+    bin_edges,
+    noise_by_intensity,
+    pool_curves,
+    select_unclipped,
+)
 from clpipe.analysis.matching.columns import Figures
 from clpipe.analysis.pictures import WHOLE, Picture
 from clpipe.analysis.repeats import check_repeats
 from clpipe.analysis.report import NoiseReport
-from clpipe.analysis.selection import select_unclipped
 from clpipe.analysis.spatial import count_pairs
 from clpipe.analysis.statistics import Channel, channel_statistics, correlation
 from clpipe.base.errors import ImageError, RequestError
@@ -22,11 +28,11 @@ from clpipe.base.extras import install_command, is_installed
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.outputs.noise_areas import FLAT, HALVED, PICTURE, covariance, halved, select_flat
 from clpipe.reference.cfa import sites
-from clpipe.reference.colour import rgb_to_ycbcr
+from clpipe.reference.colour import luma, rgb_to_ycbcr
 from clpipe.stage import Kind
 
 # The share of valid pixels, the channels, the correlations of pairs of channels, and covariances.
-Parts = tuple[float, tuple[Channel, ...], dict[tuple[str, str], float], dict[str, Doubles]]
+Parts = tuple[float, list[Channel], dict[str, float], dict[str, Doubles]]
 
 CORRELATED = 4  # sites of a mosaic; if there are more, not all pairs are correlated
 
@@ -36,7 +42,7 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
 
     Against the mean of n frames, noise is the difference times sqrt(n / (n - 1)). Noise that all
     frames share, such as column noise, is part of the mean and is not measured. Clipped intensities
-    are ignored, see :func:`clpipe.analysis.selection.select_unclipped`. In pictures, only flat
+    are ignored, see :func:`clpipe.analysis.intensity.select_unclipped`. In pictures, only flat
     areas are measured, see :func:`clpipe.outputs.noise_areas.select_flat`. The whole sigma, and the
     covariances of the whole picture before and after averaging 2x2, include every pixel.
 
@@ -49,62 +55,85 @@ def measure(images: Sequence[Picture], truth: Picture | None = None) -> NoiseRep
             not repeats of one scene.
         ImageError: there are no valid pixels.
     """
-    clean, freedom, noise, clipped = measure_against(images, truth)
+    return report_of(images, truth, NoiseOf.images(images, truth))
+
+
+def report_of(images: Sequence[Picture], truth: Picture | None, noise: "NoiseOf") -> NoiseReport:
+    """Return the report on the noise of images.
+
+    Raises:
+        ImageError: there are no valid pixels.
+    """
     first = images[0]
-    start = ~truth.clipped() if truth else np.ones(clean.shape, bool)
-    if not start.any():
+    if not noise.start.any():
         raise no_valid_samples(first)
-    span = clean[start]
+    span = noise.clean[noise.start]
     low, high = float(span.min()), float(span.max())
     if high > 0:  # values below black are in the first bin, so the shadows get enough bins
         low = max(low, 0.0)
     edges = bin_edges(low, high, first.kind != "display")
-    parts = mosaic_channels if clean.ndim == 2 else picture_channels
-    share, channels, correlations, covariances = parts(
-        first, clean, noise, clipped, start, edges, freedom
-    )
+    is_mosaic = noise.clean.ndim == 2
+    parts = mosaic_channels if is_mosaic else picture_channels
+    share, channels, correlations, covariances = parts(first, noise, edges)
     return NoiseReport(
         kind=first.kind,
         images=tuple(str(image.path) for image in images),
         truth=str(truth.path) if truth else None,
-        width=clean.shape[1],
-        height=clean.shape[0],
-        share=share,
+        width=noise.clean.shape[1],
+        height=noise.clean.shape[0],
+        share_used=share,
         edges=edges,
-        channels=channels,
-        correlations=correlations,
-        covariances=covariances,
-        notes=tuple(notes_on(images, truth, noise)),
+        channels=tuple(channels),
+        correlation=correlations,
+        covariance=covariances,
+        notes=tuple(notes_on(images, truth, noise.noise)),
         iso=next((image.iso for image in images if image.iso), None),
-        at_edges=at_edges(clean, noise, start) if clean.ndim == 3 else math.nan,
+        edges_over_flat=math.nan if is_mosaic else at_edges(noise),
         finished=finished(images, truth),
-        rounding=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
+        rounding_variance=sum(picture.step**2 / 12 for picture in (first, truth) if picture),
     )
 
 
-def measure_against(
-    images: Sequence[Picture], truth: Picture | None
-) -> tuple[Floats, float, Floats, Mask]:
-    """Return the clean image, its share of degrees of freedom, the noise, and clipped samples.
+@dataclass(frozen=True)
+class NoiseOf:
+    """The noise of images of one scene, (frame, height, width[, channel]).
 
-    For the arguments and errors, see :func:`measure`.
+    ``clean`` is the image without noise, or the mean of the frames. ``clipped`` is True for clipped
+    samples of the images, and ``start`` for samples that are not clipped in the truth. ``freedom``
+    is the share of degrees of freedom of a sample.
     """
-    check_partners(images, truth)
-    frames = np.stack([image.pixels for image in images])
-    clipped = clipped_samples(images, frames)
-    if truth:
-        return truth.pixels, 1.0, frames - truth.pixels, clipped
-    freedom = (len(images) - 1) / len(images)
-    clean = frames.mean(0, dtype=np.float64).astype(np.float32)
-    noise = (frames - clean) / np.float32(freedom**0.5)
-    check_repeats(images, clean, noise)
-    return clean, freedom, noise, clipped
+
+    clean: Floats
+    noise: Floats
+    clipped: Mask
+    start: Mask
+    freedom: float = 1.0
+
+    @classmethod
+    def images(cls, images: Sequence[Picture], truth: Picture | None) -> "NoiseOf":
+        """Return the noise of images; for the arguments and errors, see :func:`measure`."""
+        check_partners(images, truth)
+        frames = np.stack([image.pixels for image in images])
+        clipped = clipped_samples(images, frames)
+        if truth:
+            return cls(truth.pixels, frames - truth.pixels, clipped, ~truth.clipped())
+        freedom = (len(images) - 1) / len(images)
+        clean = frames.mean(0, dtype=np.float64).astype(np.float32)
+        noise = (frames - clean) / np.float32(freedom**0.5)
+        check_repeats(images, clean, noise)
+        return cls(clean, noise, clipped, np.ones(clean.shape, bool), freedom)
+
+    def by_intensity(
+        self, intensity: Floats, noise: Floats, mask: Mask, edges: Doubles
+    ) -> tuple[NoiseCurve, Floats, Floats]:
+        """Return :func:`~clpipe.analysis.intensity.noise_by_intensity` of a plane."""
+        return noise_by_intensity(intensity, noise, mask, edges, 1 - self.freedom)
 
 
-def at_edges(clean: Floats, noise: Floats, unclipped: Mask) -> float:
+def at_edges(noise: NoiseOf) -> float:
     """Return the rms of luma's noise in the steepest pixels over that in the flattest."""
-    slopes = slopes_of(rgb_to_ycbcr(clean)[..., 0], np.all(unclipped, axis=-1))
-    return slopes.ratio(np.stack([rgb_to_ycbcr(frame)[..., 0] for frame in noise]))
+    slopes = slopes_of(luma(noise.clean), np.all(noise.start, axis=-1))
+    return slopes.ratio(luma(noise.noise))
 
 
 def finished(images: Sequence[Picture], truth: Picture | None) -> Figures:
@@ -197,95 +226,70 @@ def no_valid_samples(picture: Picture, where: str = "") -> ImageError:
     )
 
 
-def picture_channels(
-    first: Picture,
-    clean: Floats,
-    noise: Floats,
-    clipped: Mask,
-    start: Mask,
-    edges: Doubles,
-    freedom: float,
-) -> Parts:
+def picture_channels(first: Picture, measured: NoiseOf, edges: Doubles) -> Parts:
     """Return R, G, B, Y, Cb and Cr of a picture, over pixels that are valid in all channels."""
-    mask: Mask = np.all(start, axis=-1)
+    clean, noise = measured.clean, measured.noise
+    mask: Mask = np.all(measured.start, axis=-1)
     for c in range(3):
-        mask = select_unclipped(clean[..., c], clipped[..., c], edges, mask)
+        mask = select_unclipped(clean[..., c], measured.clipped[..., c], edges, mask)
     if not mask.any():
         raise no_valid_samples(first)
     mask = select_flat(clean, noise, mask)
-    everywhere = np.ones_like(mask)
-    whole = covariance(noise)
-    to_ycbcr = rgb_to_ycbcr(np.eye(3, dtype=np.float32)[None])[0]
-    sigmas = np.sqrt([*np.diag(whole), *np.diag(to_ycbcr.T @ whole @ to_ycbcr)])
-    luma = rgb_to_ycbcr(clean)[..., 0]
-    planes = [clean[..., 0], clean[..., 1], clean[..., 2], luma, luma, luma]
+    planes = [*np.moveaxis(clean, -1, 0), *[luma(clean)] * 3]
     noises = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     pairs = count_pairs(mask)
     channels, standards, flat = [], {}, []
     for i, (name, plane) in enumerate(zip(names, planes, strict=True)):
-        curve, centred, standard = noise_by_intensity(
-            plane, noises[..., i], mask, edges, 1 - freedom
-        )
+        own = noises[..., i]
+        curve, centred, standard = measured.by_intensity(plane, own, mask, edges)
         fits_line = first.kind == "rgb" and name in Kind.RGB.channels
         channel = channel_statistics(
-            name, curve, centred, standard, mask, pairs, fits_line, freedom
+            name, curve, centred, standard, mask, pairs, fits_line, measured.freedom, whole=own
         )
-        channel = replace(channel, whole_sigma=float(sigmas[i]), size=noises[..., i].size)
         if name in Kind.RGB.channels:
             flat.append(centred[:, mask])
-            curve, *_ = noise_by_intensity(plane, noise[..., i], everywhere, edges, 1 - freedom)
-            channel = replace(channel, whole_curve=curve)
+            curve, *_ = measured.by_intensity(plane, own, np.ones_like(mask), edges)
+            channel = replace(channel, intensity_picture=curve)
         channels.append(channel)
         standards[name] = standard
     both = [*combinations(Kind.RGB.channels, 2), *combinations(Kind.YCBCR.channels, 2)]
-    correlations = {(a, b): correlation(standards[a], standards[b], mask) for a, b in both}
+    correlations = {f"{a}-{b}": correlation(standards[a], standards[b], mask) for a, b in both}
     samples = np.stack(flat, axis=-1)[:, None]
-    covariances = {FLAT: covariance(samples), PICTURE: whole, HALVED: covariance(halved(noise))}
-    return float(mask.mean()), tuple(channels), correlations, covariances
+    areas = {FLAT: samples, PICTURE: noise, HALVED: halved(noise)}
+    covariances = {where: covariance(own) for where, own in areas.items()}
+    return float(mask.mean()), channels, correlations, covariances
 
 
-def mosaic_channels(
-    first: Picture,
-    clean: Floats,
-    noise: Floats,
-    clipped: Mask,
-    start: Mask,
-    edges: Doubles,
-    freedom: float,
-) -> Parts:
+def mosaic_channels(first: Picture, measured: NoiseOf, edges: Doubles) -> Parts:
     """Return the sites of a mosaic, each as one plane, and the whole mosaic as one plane."""
+    clean, noise = measured.clean, measured.noise
     own = sites(first.pattern)
     steps = next(iter(own.values()))
     height, width = (size // at.step * at.step for size, at in zip(clean.shape, steps, strict=True))
     whole_mask = np.zeros((height, width), bool)
     centred, standard = (np.zeros((len(noise), height, width), np.float32) for _ in range(2))
-    channels, curves = [], []
     slices = {
         name: np.s_[..., rows.start : height : rows.step, columns.start : width : columns.step]
         for name, (rows, columns) in own.items()
     }
+    channels = []
+
+    def add(name: str, curve: NoiseCurve, at: Any) -> None:
+        mask, pairs = whole_mask[at], count_pairs(whole_mask[at])
+        statistics = centred[at], standard[at], mask, pairs, True, measured.freedom
+        channels.append(channel_statistics(name, curve, *statistics, whole=noise[at]))
+
     for name, at in slices.items():
-        mask = select_unclipped(clean[at], clipped[at], edges, start[at])
+        mask = select_unclipped(clean[at], measured.clipped[at], edges, measured.start[at])
         if not mask.any():
             raise no_valid_samples(first, f" at the sites of {name}")
-        curve, centred[at], standard[at] = noise_by_intensity(
-            clean[at], noise[at], mask, edges, 1 - freedom
-        )
+        curve, centred[at], standard[at] = measured.by_intensity(clean[at], noise[at], mask, edges)
         whole_mask[at] = mask
-        curves.append(curve)
-        pairs = count_pairs(mask)
-        channel = channel_statistics(
-            name, curve, centred[at], standard[at], mask, pairs, True, freedom
-        )
-        sigma = float(noise[at].std(dtype=np.float64))
-        channels.append(replace(channel, whole_sigma=sigma, size=noise[at].size))
-    curve, pairs = pool_curves(curves), count_pairs(whole_mask)
-    channel = channel_statistics(WHOLE, curve, centred, standard, whole_mask, pairs, True, freedom)
-    sigma = float(noise.std(dtype=np.float64))
-    channels.append(replace(channel, whole_sigma=sigma, size=noise.size))
+        add(name, curve, at)
+    add(WHOLE, pool_curves([channel.intensity for channel in channels]), np.s_[...])
     correlations = {}
     for a, b in combinations(slices if len(slices) <= CORRELATED else (), 2):
         both = whole_mask[slices[a]] & whole_mask[slices[b]]
-        correlations[a, b] = correlation(standard[slices[a]], standard[slices[b]], both)
-    return float(whole_mask.mean()), tuple(channels), correlations, {}
+        correlations[f"{a}-{b}"] = correlation(standard[slices[a]], standard[slices[b]], both)
+    return float(whole_mask.mean()), channels, correlations, {}

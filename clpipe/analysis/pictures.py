@@ -101,13 +101,11 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
         f"red {red:g}, blue {blue:g}" for red, blue in (context.gains, context.applied_gains)
     )
     balance = f"without the gains {removed} and with the gains {applied}"
-    black, white = context.black_level, context.white_level
+    black, white, full = context.black_level, context.white_level, np.float32(context.full_scale)
+    pattern, highest = context.filter_array.pattern, float(full)
+    own = Picture(path, "mosaic", pixels, pattern, white=highest, balance=balance, iso=iso)
     if black is None or white is None:  # not digitised, so nothing is clipped at black
-        highest = context.full_scale
-        clean = Picture(path, "mosaic", pixels, context.filter_array.pattern, white=highest)
-        return replace(clean, balance=balance, iso=iso)
-    full = np.float32(context.full_scale)
-    lowest = float(-black / (white - black) * full)
+        return own
     if kind == Kind.RAW.label and context.knots:
         raise ImageError(
             f"{path}: a curve has compressed its DN; give the image that is kept after the "
@@ -115,10 +113,7 @@ def load_picture(path: Path, pattern: str = "RGGB") -> Picture:
         )
     if kind == Kind.RAW.label:
         pixels = (pixels - np.float32(black)) / np.float32(white - black) * full
-    highest = float(full)
-    return Picture(
-        path, "mosaic", pixels, context.filter_array.pattern, lowest, highest, balance, iso
-    )
+    return replace(own, pixels=pixels, black=float(-black / (white - black) * full))
 
 
 def context_after(settings: Settings, stage: str | None) -> Context:

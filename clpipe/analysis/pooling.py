@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.analysis.calibration.line_fit import Estimate, weighted
 from clpipe.analysis.intensity import NoiseCurve, VarianceLaw, bin_edges, bin_of, pool_curves
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.spatial import LineNoise
@@ -43,50 +44,50 @@ def pool(reports: Sequence[NoiseReport]) -> NoiseReport:
     low, high = (end(report.edges[k] for report in reports) for end, k in ((min, 0), (max, -1)))
     edges = bin_edges(low, high, first.kind != "display")
     sizes = np.array([len(r.images) * r.width * r.height for r in reports], float)
-    used = sizes * [r.share for r in reports]
+    used = sizes * [r.share_used for r in reports]
     channels = (
         pool_channel(each, edges) for each in zip(*(r.channels for r in reports), strict=True)
     )
-    pairs = {pair: [r.correlations[pair] for r in reports] for pair in first.correlations}
-    tables = {where: [r.covariances[where] for r in reports] for where in first.covariances}
+    pairs = {pair: [r.correlation[pair] for r in reports] for pair in first.correlation}
+    tables = {where: [r.covariance[where] for r in reports] for where in first.covariance}
     finished = {name: [r.finished[name] for r in reports] for name in first.finished}
     return replace(
         first,
         images=tuple(image for report in reports for image in report.images),
-        share=float(used.sum() / sizes.sum()),
+        share_used=float(used.sum() / sizes.sum()),
         edges=edges,
         channels=tuple(channels),
-        correlations={pair: float(mean(values, used)) for pair, values in pairs.items()},
-        covariances={
+        correlation={pair: float(mean(values, used)) for pair, values in pairs.items()},
+        covariance={
             where: mean(values, used if where == "flat" else sizes)
             for where, values in tables.items()
         },
         notes=tuple(dict.fromkeys(note for report in reports for note in report.notes)),
         bursts=len(reports),
-        at_edges=float(mean([r.at_edges for r in reports], sizes)),
+        edges_over_flat=float(mean([r.edges_over_flat for r in reports], sizes)),
         finished={name: float(mean(values, sizes)) for name, values in finished.items()},
     )
 
 
 def pool_channel(channels: Sequence[Channel], edges: Doubles) -> Channel:
     """Return one channel from several bursts, with intensity bins between these edges."""
-    count = np.array([one.count for one in channels], float)
+    count = np.array([one.samples for one in channels], float)
     sizes = np.array([one.size for one in channels], float)
     laws = [one.law for one in channels if one.law]
-    whole = [one.whole_curve for one in channels if one.whole_curve]
+    whole = [one.intensity_picture for one in channels if one.intensity_picture]
     return Channel(
         name=channels[0].name,
-        count=int(count.sum()),
+        samples=int(count.sum()),
         sigma=root_mean_square([one.sigma for one in channels], count),
-        curve=pool_curves([rebinned(one.curve, edges) for one in channels]),
+        intensity=pool_curves([rebinned(one.intensity, edges) for one in channels]),
         law=pool_laws(laws) if len(laws) == len(channels) else None,
-        rows=pool_lines([one.rows for one in channels], count),
-        columns=pool_lines([one.columns for one in channels], count),
+        row=pool_lines([one.row for one in channels], count),
+        column=pool_lines([one.column for one in channels], count),
         autocorrelation=mean([one.autocorrelation for one in channels], count),
-        energy_left=float(mean([one.energy_left for one in channels], count)),
+        energy_left_2x2=float(mean([one.energy_left_2x2 for one in channels], count)),
         tails=pool_tails([one.tails for one in channels], count),
-        whole_sigma=root_mean_square([one.whole_sigma for one in channels], sizes),
-        whole_curve=pool_curves([rebinned(each, edges) for each in whole]) if whole else None,
+        sigma_picture=root_mean_square([one.sigma_picture for one in channels], sizes),
+        intensity_picture=pool_curves([rebinned(each, edges) for each in whole]) if whole else None,
         size=int(sizes.sum()),
     )
 
@@ -113,13 +114,9 @@ def rebinned(curve: NoiseCurve, edges: Doubles) -> NoiseCurve:
 
 def pool_laws(laws: Sequence[VarianceLaw]) -> VarianceLaw:
     """Return the mean of several laws, weighted by the inverse of their squared errors."""
-    numbers = []
-    for name in ("a", "b"):
-        values = np.array([getattr(law, name) for law in laws])
-        weights = np.array([getattr(law, f"{name}_error") for law in laws]).clip(1e-300) ** -2.0
-        numbers.append((float(np.average(values, weights=weights)), float(weights.sum() ** -0.5)))
-    (a, a_error), (b, b_error) = numbers
-    return VarianceLaw(a, b, a_error, b_error)
+    a = weighted([Estimate(law.a, law.a_error) for law in laws])
+    b = weighted([Estimate(law.b, law.b_error) for law in laws])
+    return VarianceLaw(a.value, b.value, a.error, b.error)
 
 
 def pool_lines(lines: Sequence[LineNoise], count: Doubles) -> LineNoise:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
-from clpipe.analysis.intensity import NoiseCurve
-from clpipe.analysis.spatial import LineNoise
+import numpy as np
+
+from clpipe.analysis.intensity import NOT_IN_JSON
 from clpipe.analysis.statistics import HISTOGRAM, SIGMAS, Channel, gaussian_beyond
 from clpipe.base.types import Doubles
 
@@ -19,97 +20,73 @@ UNITS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NoiseReport:
     """The measured noise of some images, channel by channel."""
 
     kind: str
+    iso: float | None = None  # None if the images do not state it
+    bursts: int = 1  # number of bursts whose noise is pooled
+    rounding_variance: float = 0.0  # that rounding in files adds to each channel
     images: tuple[str, ...]
     truth: str | None  # None: the mean of the images
     width: int
     height: int
-    share: float  # share of valid pixels, or of valid samples in a mosaic
-    edges: Doubles  # edges of the intensity bins
-    channels: tuple[Channel, ...]
-    correlations: Mapping[tuple[str, str], float]
-    covariances: Mapping[str, Doubles]  # RGB covariance matrices, (3, 3), by area; {} for mosaics
+    share_used: float  # share of valid pixels, or of valid samples in a mosaic
     notes: tuple[str, ...]
-    iso: float | None = None  # None if the images do not state it
-    bursts: int = 1  # number of bursts whose noise is pooled
+    channels: tuple[Channel, ...]
     # RMS of luma noise at edges relative to flat areas; only for pictures.
-    at_edges: float = math.nan
+    edges_over_flat: float = math.nan
     finished: Mapping[str, float] = field(default_factory=dict)  # see clpipe.analysis.finished
-    rounding: float = 0.0  # the variance that rounding in files adds to each channel
+    covariance: Mapping[str, Doubles]  # RGB covariance matrices, (3, 3), by area; {} for mosaics
+    correlation: Mapping[str, float]  # of two channels, such as "R-G"
     frames: int = 0  # the number of frames of a clip; 0 for images
     # The correlation with frames 1, 2 and more later, by channel; only for clips.
-    temporal: Mapping[str, Doubles] = field(default_factory=dict)
+    temporal_correlation: Mapping[str, Doubles] = field(default_factory=dict)
+    edges: Doubles = field(metadata=NOT_IN_JSON)  # edges of the intensity bins
 
     def record(self) -> dict[str, Any]:
         """Return the report as JSON values; unknown values are null."""
-        return {
-            "kind": self.kind,
-            "unit": UNITS[self.kind],
-            "iso": self.iso,
-            "bursts": self.bursts,
-            "rounding_variance": self.rounding,
-            "images": list(self.images),
-            "truth": self.truth,
-            "width": self.width,
-            "height": self.height,
-            "share_used": self.share,
-            "notes": list(self.notes),
-            "channels": {channel.name: channel_record(channel) for channel in self.channels},
-            "edges_over_flat": json_number(self.at_edges),
-            "finished": {name: json_number(value) for name, value in self.finished.items()},
-            "covariance": {where: table.tolist() for where, table in self.covariances.items()},
-            "correlation": {f"{a}-{b}": json_number(r) for (a, b), r in self.correlations.items()},
-            "frames": self.frames,
-            "temporal_correlation": {
-                name: list(map(json_number, values)) for name, values in self.temporal.items()
-            },
-        }
+        channels = {channel.name: channel_record(channel) for channel in self.channels}
+        return (
+            {"kind": self.kind, "unit": UNITS[self.kind]}
+            | json_value(self)
+            | {"channels": channels}
+        )
 
 
-def json_number(value: float) -> float | None:
-    """Return a number for JSON, in which NaN becomes null."""
-    return None if math.isnan(value) else float(value)
+def json_value(value: Any) -> Any:
+    """Return a value for JSON: data classes as objects, arrays as lists, and NaN as null.
+
+    Fields with the metadata NOT_IN_JSON are omitted.
+
+    >>> json_value({"a": np.array([1.5, np.nan]), "b": (1, None)})
+    {'a': [1.5, None], 'b': [1, None]}
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if is_dataclass(value):
+        names = (each.name for each in fields(value) if each.metadata != NOT_IN_JSON)
+        value = {name: getattr(value, name) for name in names}
+    if isinstance(value, Mapping):
+        return {str(key): json_value(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(each) for each in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def line_record(lines: LineNoise) -> dict[str, float | None]:
-    """Row or column noise as JSON values."""
-    return {name: json_number(value) for name, value in asdict(lines).items()}
-
-
-def curve_record(curve: NoiseCurve) -> dict[str, list[float]]:
-    """Noise by intensity as JSON values."""
-    return {
-        "mean": curve.mean.tolist(),
-        "sigma": curve.sigma.tolist(),
-        "shift": curve.shift.tolist(),
-        "samples": curve.count.tolist(),
-    }
+def json_object(**values: Any) -> dict[str, Any]:
+    """Return values by name as a JSON object, see :func:`json_value`."""
+    return {name: json_value(value) for name, value in values.items()}
 
 
 def channel_record(channel: Channel) -> dict[str, Any]:
     """Return a channel as JSON values."""
-    law, tails = channel.law, channel.tails
-    whole = channel.whole_curve
-    return {
-        "samples": channel.count,
-        "sigma": channel.sigma,
-        "sigma_picture": channel.whole_sigma,
-        "law": law and asdict(law),
-        "intensity": curve_record(channel.curve),
-        "intensity_picture": whole and curve_record(whole),
-        "row": line_record(channel.rows),
-        "column": line_record(channel.columns),
-        "autocorrelation": [
-            [json_number(r) for r in row] for row in channel.autocorrelation.tolist()
-        ],
-        "energy_left_2x2": json_number(channel.energy_left),
-        "skewness": json_number(tails.skewness),
-        "excess_kurtosis": json_number(tails.excess_kurtosis),
-        "beyond": {str(k): json_number(p) for k, p in zip(SIGMAS, tails.beyond, strict=True)},
-        "gaussian_beyond": {str(k): gaussian_beyond(k) for k in SIGMAS},
-        "histogram": {"edges": HISTOGRAM.round(2).tolist(), "samples": tails.histogram.tolist()},
-    }
+    tails, found = channel.tails, json_value(channel)
+    return found | json_object(
+        skewness=tails.skewness,
+        excess_kurtosis=tails.excess_kurtosis,
+        beyond=dict(zip(SIGMAS, tails.beyond, strict=True)),
+        gaussian_beyond={k: gaussian_beyond(k) for k in SIGMAS},
+        histogram={"edges": HISTOGRAM.round(2), "samples": tails.histogram},
+    )

@@ -22,7 +22,7 @@ MIN_CONTRAST = 0.03  # between the plateaus, in linear light
 MAX_BEND = 0.35  # px; rms distance of an edge's points from its line
 MAX_UNEVENNESS = 0.15  # rms of a plateau over the contrast
 MIN_EDGES = 12
-LUMA = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # weights of BT.709, for linear light
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def edges_in(picture: Array) -> list[Edge]:
         picture: (height, width, 3) uint8, as written to a file: sRGB.
     """
     light = inverse_srgb_curve(picture / 255)
-    luma = light @ LUMA
+    luma = light @ LUMINANCE
     down, across = np.gradient(luma)
     height, width = luma.shape
     found: list[Edge] = []

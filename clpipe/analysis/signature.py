@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.types import Doubles, Mask
+from clpipe.reference.colour import luma
 
 DRIFT = 12.0  # px; smoother differences are changes of light or focus, not noise
 SMOOTH = 3.0  # px; the picture is blurred by this sigma to find flat areas
@@ -16,18 +17,6 @@ BIN = 8  # levels per bin of intensity
 MIN_SAMPLES = 200  # samples that a bin needs
 DARKEST, BRIGHTEST = 30, 225  # luma of the darkest and brightest pixels that are measured
 DARK = 8  # luma of the darkest pixels in which noise is compared by intensity
-
-LUMA = np.array([0.299, 0.587, 0.114])  # weights of BT.601
-
-
-def luma(pixels: NDArray[np.number]) -> Doubles:
-    """Return BT.601 luma of (..., 3) levels."""
-    return np.asarray(pixels @ LUMA, np.float64)
-
-
-def chroma(noise: Doubles, of_luma: Doubles) -> tuple[Doubles, Doubles]:
-    """Return Cb and Cr of (height, width, 3) noise whose luma is ``of_luma``."""
-    return 0.564 * (noise[..., 2] - of_luma), 0.713 * (noise[..., 0] - of_luma)
 
 
 def flat_mask(mean: NDArray[np.number], darkest: float = DARKEST) -> Mask:

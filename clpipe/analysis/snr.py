@@ -1,12 +1,11 @@
 """The signal-to-noise ratio by intensity, over all stops of the images."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.analysis.measure import measure_against
+from clpipe.analysis.measure import NoiseOf
 from clpipe.analysis.pictures import Picture
 
 PER_STOP = 2  # steps per stop of intensity
@@ -40,11 +39,9 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
     Raises:
         RequestError, ImageError: as there.
     """
-    clean, _, noise, clipped = measure_against(images, truth)
-    counts = (clean > 0) & ~np.any(clipped, axis=0)
-    if truth:
-        counts &= ~truth.clipped()
-    light = clean[counts].astype(np.float64)
+    measured = NoiseOf.images(images, truth)
+    counts = (measured.clean > 0) & measured.start & ~np.any(measured.clipped, axis=0)
+    light = measured.clean[counts].astype(np.float64)
     if not light.size:
         return []
     brightest = float(light.max())
@@ -52,17 +49,13 @@ def snr_curve(images: Sequence[Picture], truth: Picture | None = None) -> list[S
     curve = []
     for step in range(STOPS * PER_STOP, -1, -1):
         own = steps == step
-        if int(own.sum()) * len(noise) < MIN_SAMPLES:
+        samples = int(own.sum()) * len(measured.noise)
+        if samples < MIN_SAMPLES:
             continue
         mean = float(light[own].mean())
         # The mean is subtracted, because a difference of tone is not noise.
-        sigma = float(noise[:, counts][:, own].std(dtype=np.float64))
+        sigma = float(measured.noise[:, counts][:, own].std(dtype=np.float64))
         ratio = 20 * np.log10(mean / sigma) if sigma else np.inf
         stops = float(np.log2(brightest / mean))
-        curve.append(SnrStep(mean, stops, float(ratio), int(own.sum()) * len(noise)))
+        curve.append(SnrStep(mean, stops, float(ratio), samples))
     return curve
-
-
-def record_of(curve: Sequence[SnrStep]) -> list[dict[str, Any]]:
-    """Return a curve as JSON values."""
-    return [asdict(step) for step in curve]

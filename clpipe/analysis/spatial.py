@@ -4,6 +4,7 @@ Functions take noise, (frame, height, width), and ``mask``, (height, width), whi
 pixels. A value that cannot be computed is NaN.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -24,32 +25,47 @@ class LineNoise:
     limit: float
 
 
-def lag_sums(planes: NDArray[np.floating[Any]]) -> Doubles:
+def lag_sums(planes: NDArray[np.floating[Any]], lags: int = LAGS) -> Doubles:
     """Return the sums of products of pixel pairs at lags of -8 to 8 down and right, (17, 17).
 
-    They are computed by Fourier transform (Wiener-Khinchin), with a margin of zeros that prevents
-    wrapping. ``planes`` is (frame, height, width).
-    """
-    height, width = planes.shape[1:]
-    shape = (height + LAGS, width + LAGS)
-    lag = np.arange(-LAGS, LAGS + 1)
-    total = np.zeros((lag.size, lag.size))
-    for plane in planes:
-        whole = np.fft.irfft2(np.abs(np.fft.rfft2(plane, shape)) ** 2, shape)
-        total += whole[np.ix_(lag % shape[0], lag % shape[1])]
-    return total
-
-
-def count_pairs(mask: Mask) -> Doubles:
-    """Return the number of pairs of valid pixels at each lag, (17, 17)."""
-    return np.rint(lag_sums(mask[None].astype(np.float64)))
-
-
-def autocorrelation(standard: Floats, pairs: Doubles) -> Doubles:
-    """Return the autocorrelation of standardised noise, (17, 17): lags of -8 to 8 down and right.
+    They are computed from the power spectrum (Wiener-Khinchin), with a margin of zeros that
+    prevents wrapping, and in the precision of the planes.
 
     Args:
-        standard: (frame, height, width), 0 for invalid pixels.
+        planes: (frame, height, width).
+        lags: the largest lag, px.
+    """
+    height, width = (fast_size(size + lags) for size in planes.shape[1:])
+    power = np.zeros((height, width // 2 + 1), planes.dtype)
+    for plane in planes:
+        waves = np.fft.rfft2(plane, (height, width))
+        power += waves.real**2 + waves.imag**2
+    steps = np.arange(-lags, lags + 1)
+    rows = np.fft.ifft(power, axis=0)[steps]
+    return np.asarray(np.fft.irfft(rows, width)[:, steps], np.float64)
+
+
+def fast_size(size: int) -> int:
+    """Return the next size of a fast Fourier transform, without prime factors above 5.
+
+    >>> fast_size(518)
+    540
+    """
+    return next(n for n in itertools.count(size) if 60**20 % n == 0)
+
+
+def count_pairs(mask: Mask, lags: int = LAGS) -> Doubles:
+    """Return the number of pairs of valid pixels at each lag, (17, 17)."""
+    return np.rint(lag_sums(mask[None].astype(np.float64), lags))
+
+
+def autocorrelation(planes: NDArray[np.floating[Any]], pairs: Doubles) -> Doubles:
+    """Return the autocorrelation of noise over all frames, like ``pairs``: (17, 17).
+
+    Lag 0 is in the middle. Values are NaN at lags without pairs, and everywhere without noise.
+
+    Args:
+        planes: (frame, height, width), 0 for invalid pixels.
         pairs: :func:`count_pairs` of the mask.
 
     >>> plane = np.random.default_rng(0).normal(size=(1, 200, 200)).astype(np.float32)
@@ -57,10 +73,44 @@ def autocorrelation(standard: Floats, pairs: Doubles) -> Doubles:
     >>> round(float(table[8, 8]), 6), bool(abs(table[8, 9]) < 0.03)
     (1.0, True)
     """
-    products = lag_sums(standard)
-    covariance = np.divide(products, pairs, out=np.full_like(products, np.nan), where=pairs > 0)
-    variance = covariance[LAGS, LAGS]
-    return covariance / variance if variance > 0 else np.full_like(covariance, np.nan)
+    lags = len(pairs) // 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        covariance = np.where(pairs > 0, lag_sums(planes, lags) / pairs, np.nan)
+        variance = covariance[lags, lags]
+        return np.asarray(covariance / (variance if variance > 0 else np.nan))
+
+
+def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the power spectrum of an autocorrelation, and the frequencies, (64, 64) each.
+
+    It is the transform of the autocorrelation with a triangular window (Blackman and Tukey, 1958;
+    the window is Bartlett's). Independent noise has 1 everywhere. Frequencies are in cycles per
+    pixel.
+    """
+    lags = len(table) // 2
+    steps, frequency = np.arange(-lags, lags + 1), np.fft.fftfreq(64)
+    fall = 1 - np.abs(steps) / (lags + 1)
+    waves = np.exp(-2j * np.pi * np.outer(frequency, steps))
+    spectrum = (waves @ (np.nan_to_num(table) * np.outer(fall, fall)) @ waves.T).real
+    return spectrum, np.hypot(frequency[:, None], frequency[None])
+
+
+def radial_spectrum(table: Doubles, most: float, rings: int) -> tuple[Doubles, Doubles]:
+    """Return the mean power of an autocorrelation in rings of frequency, see :func:`spectrum_of`.
+
+    Args:
+        table: the autocorrelation.
+        most: the highest frequency, cycles/px.
+        rings: the number of rings.
+
+    Returns:
+        The frequencies in the middle of the rings, and the power: 1 for independent noise.
+    """
+    spectrum, radius = spectrum_of(table)
+    edges = np.linspace(0, most, rings + 1)
+    number = np.digitize(radius, edges)
+    power = [spectrum[number == k].mean() for k in range(1, len(edges))]
+    return (edges[1:] + edges[:-1]) / 2, np.array(power)
 
 
 def line_noise(noise: Floats, mask: Mask) -> LineNoise:

@@ -5,12 +5,12 @@ noise is noise divided by its sigma at that intensity. A value that cannot be co
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clpipe.analysis.intensity import NoiseCurve, VarianceLaw, fit_variance
+from clpipe.analysis.intensity import NOT_IN_JSON, NoiseCurve, VarianceLaw, fit_variance
 from clpipe.analysis.spatial import LineNoise, autocorrelation, energy_left, line_noise
 from clpipe.base.types import Doubles, Floats, Mask
 
@@ -33,19 +33,22 @@ class Tails:
 class Channel:
     """The noise of one channel; sigmas are in the channel's unit."""
 
-    name: str
-    count: int  # samples in all frames
+    name: str = field(metadata=NOT_IN_JSON)
+    samples: int  # in all frames
     sigma: float
-    curve: NoiseCurve
+    # Sigma of all pixels, including invalid ones.
+    sigma_picture: float = field(default=math.nan, kw_only=True)
     law: VarianceLaw | None
-    rows: LineNoise
-    columns: LineNoise
+    intensity: NoiseCurve
+    # Noise by intensity of all pixels.
+    intensity_picture: NoiseCurve | None = field(default=None, kw_only=True)
+    row: LineNoise
+    column: LineNoise
     autocorrelation: Doubles  # (17, 17), down and right from -8 to 8; [8, 8] is 1
-    energy_left: float  # share of the energy that remains after averaging 2x2 pixels
-    tails: Tails
-    whole_sigma: float = math.nan  # sigma of all pixels, including invalid ones
-    whole_curve: NoiseCurve | None = None  # noise curve of all pixels
-    size: int = 0  # number of samples, including invalid ones
+    energy_left_2x2: float  # share of the energy that remains after averaging 2x2 pixels
+    tails: Tails = field(metadata=NOT_IN_JSON)
+    # The number of samples, including invalid ones.
+    size: int = field(default=0, kw_only=True, metadata=NOT_IN_JSON)
 
     @property
     def right(self) -> float:
@@ -92,6 +95,7 @@ def channel_statistics(
     pairs: Doubles,
     fits_line: bool,
     freedom: float = 1.0,
+    whole: Floats | None = None,
 ) -> Channel:
     """Return all statistics of one channel.
 
@@ -104,6 +108,7 @@ def channel_statistics(
         pairs: :func:`clpipe.analysis.spatial.count_pairs` of the mask.
         fits_line: whether to fit a line, because the variance is linear in the intensity.
         freedom: the degrees of freedom of a sample, below 1 if the truth is a mean of frames.
+        whole: the noise of all pixels, including invalid ones.
     """
     table = autocorrelation(standard, pairs)
     # Correlated samples count as fewer independent ones: their number is divided by the sum of the
@@ -123,13 +128,15 @@ def channel_statistics(
         law = replace(law, b_error=float(np.hypot.reduce([law.b_error, *line_errors])))
     return Channel(
         name=name,
-        count=samples.size,
+        samples=samples.size,
         sigma=float(np.sqrt((samples**2).mean())),
-        curve=curve,
+        intensity=curve,
         law=law,
-        rows=rows,
-        columns=columns,
+        row=rows,
+        column=columns,
         autocorrelation=table,
-        energy_left=energy_left(standard, mask),
+        energy_left_2x2=energy_left(standard, mask),
         tails=tails(standard, mask),
+        sigma_picture=math.nan if whole is None else float(whole.std(dtype=np.float64)),
+        size=0 if whole is None else whole.size,
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.analysis.measure import measure
+from clpipe.analysis.measure import NoiseOf, report_of
 from clpipe.analysis.pictures import Picture
 from clpipe.analysis.report import NoiseReport
 from clpipe.base.errors import RequestError
@@ -58,17 +58,15 @@ def measure_clip(path: Path) -> NoiseReport:
         ImageError: the clip cannot be read, or has no valid pixels.
     """
     pictures = load_frames(path)
-    report = measure(pictures)
-    frames = np.stack([picture.pixels for picture in pictures])
-    clean = frames.mean(0, dtype=np.float64).astype(np.float32)
-    noise = frames - clean
-    clipped = np.stack([picture.clipped() for picture in pictures])
-    usable: Mask = ~clipped.any(axis=(0, -1))  # type: ignore[assignment]
-    flat = select_flat(clean, noise, usable)
+    measured = NoiseOf.images(pictures, None)
+    report = report_of(pictures, None, measured)
+    usable: Mask = ~measured.clipped.any(axis=(0, -1))  # type: ignore[assignment]
+    noise = measured.noise
+    flat = select_flat(measured.clean, noise, usable)
     planes = np.concatenate([noise, rgb_to_ycbcr(noise)], axis=-1)[:, flat]
     names = (*Kind.RGB.channels, *Kind.YCBCR.channels)
     temporal = {name: temporal_correlation(planes[..., c]) for c, name in enumerate(names)}
-    return replace(report, images=(str(path),), frames=len(pictures), temporal=temporal)
+    return replace(report, images=(str(path),), frames=len(pictures), temporal_correlation=temporal)
 
 
 def temporal_correlation(noise: Floats, lags: int = LAGS) -> Doubles:

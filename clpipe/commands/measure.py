@@ -11,8 +11,8 @@ from clpipe.analysis.finished import finished_rows
 from clpipe.analysis.measure import measure as measure_images
 from clpipe.analysis.pictures import load_picture
 from clpipe.analysis.pooling import pool_by_iso
-from clpipe.analysis.report import UNITS, NoiseReport
-from clpipe.analysis.snr import MIN_SAMPLES, SnrStep, record_of, snr_curve
+from clpipe.analysis.report import UNITS, NoiseReport, json_value
+from clpipe.analysis.snr import MIN_SAMPLES, SnrStep, snr_curve
 from clpipe.analysis.spatial import LAGS, LineNoise
 from clpipe.analysis.statistics import SIGMAS, gaussian_beyond
 from clpipe.analysis.temporal import measure_clip
@@ -132,7 +132,7 @@ def show_snr(curve: Sequence[SnrStep], as_json: bool) -> None:
             "larger images"
         )
     if as_json:
-        show_json({"snr": record_of(curve)})
+        show_json({"snr": json_value(curve)})
         return
     rows = [
         (f"{x.intensity:.4g}", f"{x.stops:.1f}", f"{x.decibels:.1f}", str(x.samples)) for x in curve
@@ -159,22 +159,16 @@ def measure_heading(report: NoiseReport) -> str:
     at = f", ISO {report.iso:g}" if report.iso else ""
     unit_text = "samples" if report.kind in ("mosaic", "values") else "pixels (flat, not clipped)"
     count = report.frames or len(report.images)
+    ratio = f"{report.edges_over_flat:.2f} times"
+    edges = f"luma noise is {ratio} as strong at edges (steepest tenth) as in the flattest quarter"
     lines = [
         f"{count} x {report.kind}{of}, {report.width}x{report.height}{at}, against {against}; "
         f"unit: {UNITS[report.kind]}",
-        f"{report.share:.1%} of the {unit_text} are used; sigma (all) uses every one",
-        *edges_text(report),
+        f"{report.share_used:.1%} of the {unit_text} are used; sigma (all) uses every one",
+        *([] if math.isnan(report.edges_over_flat) else [edges]),
         *(f"note: {note}" for note in report.notes),
     ]
     return "\n".join(lines)
-
-
-def edges_text(report: NoiseReport) -> list[str]:
-    """Return how much stronger the noise of pictures is at edges, or [] for other images."""
-    if math.isnan(report.at_edges):
-        return []
-    ratio = f"{report.at_edges:.2f} times"
-    return [f"luma noise is {ratio} as strong at edges (steepest tenth) as in the flattest quarter"]
 
 
 def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
@@ -182,7 +176,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
     names = [channel.name for channel in report.channels]
     laws = ["a", "b"] if any(channel.law for channel in report.channels) else []
     which = "not clipped" if report.kind in ("mosaic", "values") else "flat"
-    sigmas_of = f"sigma ({which}, {report.share:.0%})", "sigma (all, 100%)"
+    sigmas_of = f"sigma ({which}, {report.share_used:.0%})", "sigma (all, 100%)"
     noise_rows: Rows = [("", "samples", *sigmas_of, *laws, "row sigma", "column sigma")]
     correlation_rows: Rows = [
         ("", *(f"{k}" for k in range(1, LAGS + 1)), "diagonal 1", "left after 2x2")
@@ -192,15 +186,15 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         fit = [""] * len(laws)
         if law := channel.law:
             fit = [f"{law.a:.4g} ± {law.a_error:.1g}", f"{law.b:.4g} ± {law.b_error:.1g}"]
-        lines = line_text(channel.rows), line_text(channel.columns)
-        sizes = number(channel.sigma, ".4g"), number(channel.whole_sigma, ".4g")
-        noise_rows.append((channel.name, str(channel.count), *sizes, *fit, *lines))
+        lines = line_text(channel.row), line_text(channel.column)
+        sizes = number(channel.sigma, ".4g"), number(channel.sigma_picture, ".4g")
+        noise_rows.append((channel.name, str(channel.samples), *sizes, *fit, *lines))
         table, middle = channel.autocorrelation, slice(LAGS + 1, None)
         right = [number(r, ".3f") for r in table[LAGS, middle]]
         down = [number(r, ".3f") for r in table[middle, LAGS]]
         diagonal = number(table[LAGS + 1, LAGS + 1], ".3f")
         correlation_rows.append(
-            (f"{channel.name} right", *right, diagonal, number(channel.energy_left, ".3f"))
+            (f"{channel.name} right", *right, diagonal, number(channel.energy_left_2x2, ".3f"))
         )
         correlation_rows.append((f"{channel.name} down", *down, "", ""))
         tails = channel.tails
@@ -208,7 +202,7 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         tail_rows.append((channel.name, *moments, *(number(p, ".2g") for p in tails.beyond)))
     tail_rows.append(("Gaussian", "0", "0", *(f"{gaussian_beyond(k):.2g}" for k in SIGMAS)))
     sigmas = [
-        dict(zip(channel.curve.bins, channel.curve.sigma, strict=True))
+        dict(zip(channel.intensity.bins, channel.intensity.sigma, strict=True))
         for channel in report.channels
     ]
     intensity_rows: Rows = [("intensity", *names)]
@@ -218,17 +212,14 @@ def measure_tables(report: NoiseReport) -> list[tuple[str, Rows]]:
         intensity_rows.append((f"{middle_of_bin:.3f}", *values))
     finished_table: Rows = [("", "here", "real cameras")]
     finished_table += [(t, f"{v:.2f}", real) for t, v, real in finished_rows(report.finished)]
-    pairs = [f"{a}-{b}" for a, b in report.correlations]
-    channel_correlations: Rows = [
-        tuple(pairs),
-        tuple(number(r, ".3f") for r in report.correlations.values()),
-    ]
+    pairs = report.correlation
+    channel_correlations: Rows = [tuple(pairs), tuple(number(r, ".3f") for r in pairs.values())]
     return [
         ("noise" + ("; variance = a * intensity + b" if laws else ""), noise_rows),
         ("autocorrelation (independent noise: 0; left after 2x2: 0.25)", correlation_rows),
-        *([(TEMPORAL, temporal_rows(report))] if report.temporal else []),
+        *([(TEMPORAL, temporal_rows(report))] if report.temporal_correlation else []),
         *([("correlation between channels", channel_correlations)] if pairs else []),
-        *([("covariance of the channels", covariance_rows(report))] if report.covariances else []),
+        *([("covariance of the channels", covariance_rows(report))] if report.covariance else []),
         ("tails of standardised noise", tail_rows),
         ("sigma by intensity", intensity_rows),
         *([(FINISHED, finished_table)] if len(finished_table) > 1 else []),
@@ -242,19 +233,19 @@ AREA_NAMES = {FLAT: "flat areas", PICTURE: "all", HALVED: "all, after 2x2"}
 
 def covariance_rows(report: NoiseReport) -> Rows:
     """Return the covariances of red, green and blue, one row for each set of pixels."""
-    first, *_ = report.covariances.values()
+    first, *_ = report.covariance.values()
     places = [(i, j) for i in range(len(first)) for j in range(i, len(first))]
     names = Kind.RGB.channels
     rows: Rows = [("", *(f"{names[i]}-{names[j]}" for i, j in places))]
-    for where, table in report.covariances.items():
+    for where, table in report.covariance.items():
         rows.append((AREA_NAMES[where], *(number(float(table[at]), ".4g") for at in places)))
     return rows
 
 
 def temporal_rows(report: NoiseReport) -> Rows:
     """Return the correlations with later frames, one row for each channel."""
-    lags = len(next(iter(report.temporal.values())))
+    lags = len(next(iter(report.temporal_correlation.values())))
     rows: Rows = [("frames later", *map(str, range(1, lags + 1)))]
-    for name, values in report.temporal.items():
+    for name, values in report.temporal_correlation.items():
         rows.append((name, *(number(float(value), ".3f") for value in values)))
     return rows

@@ -20,7 +20,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Mount, Route
 
-from clpipe.analysis.svg import PAGE_FILES, noise_svg
+from clpipe.analysis.plot import noise_svg
+from clpipe.analysis.svg import PAGE_FILES
 from clpipe.base.errors import ClpipeError, KeyedError, RequestError
 from clpipe.base.reading import parse_json
 from clpipe.base.types import Array

@@ -196,7 +196,7 @@ def find_jobs(
                 )
                 for row in read_manifest(path)
             ]
-        elif (matches := numbered_files(text) or _glob_files(text)) is not None:
+        elif (matches := numbered_files(text) or glob_files(text)) is not None:
             jobs += [Job(Path(m), Path(m).name) for m in matches if m not in excluded]
         else:
             clip = clip_of(path)
@@ -243,7 +243,7 @@ def _frames(job: Job, endings: Sequence[str]) -> Iterator[Job]:
         yield replace(job, path=frame_path(path, number), key=name, time=time)
 
 
-def _glob_files(text: str) -> list[str] | None:
+def glob_files(text: str) -> list[str] | None:
     """Return the files that a glob matches; None if the text is no glob, or names a file.
 
     Raises:

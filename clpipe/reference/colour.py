@@ -1,20 +1,33 @@
 """Luma and colour differences, like in ``kernels/lib/colour.h``."""
 
-import numpy as np
+from typing import Any, TypeVar
 
-from clpipe.base.types import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+from clpipe.base.types import Array, Floats
+
+Float = TypeVar("Float", bound=np.floating[Any])
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
-def rgb_to_ycbcr(image: Floats) -> Floats:
-    """Apply ITU-R BT.601: Y = 0.299R + 0.587G + 0.114B, Cb = 0.564(B-Y), Cr = 0.713(R-Y).
+def luma(image: Array) -> Array:
+    """Return the luma of ITU-R BT.601 of (..., 3) RGB: Y = 0.299R + 0.587G + 0.114B.
 
-    ``image`` is (height, width, 3), linear RGB. The result has the same shape and contains Y, Cb,
-    Cr.
+    Floats keep their precision; whole numbers become float32.
     """
     red, green, blue = np.moveaxis(image, -1, 0)
-    y = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+    return np.asarray(LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue)
+
+
+def rgb_to_ycbcr(image: NDArray[Float]) -> NDArray[Float]:
+    """Apply ITU-R BT.601: :func:`luma` Y, Cb = 0.564(B-Y), Cr = 0.713(R-Y).
+
+    ``image`` is (..., 3) RGB, in floats. The result has the same shape and precision.
+    """
+    red, _, blue = np.moveaxis(image, -1, 0)
+    y = luma(image)
     return np.stack([y, np.float32(0.564) * (blue - y), np.float32(0.713) * (red - y)], axis=-1)
 
 

@@ -245,20 +245,14 @@ def places_of(pixels: Array, reduction: int) -> list[Crop]:
     if reduction == 1:
         return found
     wide, high = min(CROP[0], width), min(CROP[1], height)
-    return [
-        replace(
-            place,
-            left=min(
-                max(reduction * (2 * place.left + place.width) // 2 - wide // 2, 0), width - wide
-            ),
-            top=min(
-                max(reduction * (2 * place.top + place.height) // 2 - high // 2, 0), height - high
-            ),
-            width=wide,
-            height=high,
-        )
-        for place in found
-    ]
+
+    def enlarged(place: Crop) -> Crop:
+        left = reduction * (2 * place.left + place.width) // 2 - wide // 2
+        top = reduction * (2 * place.top + place.height) // 2 - high // 2
+        left, top = min(max(left, 0), width - wide), min(max(top, 0), height - high)
+        return replace(place, left=left, top=top, width=wide, height=high)
+
+    return list(map(enlarged, found))
 
 
 def select_images(run: Run, names: Collection[str]) -> list[RunPicture]:

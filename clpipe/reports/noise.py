@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,9 @@ from clpipe.analysis.finished import finished_rows
 from clpipe.analysis.intensity import VarianceLaw
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
+from clpipe.analysis.plot import law_svg, noise_svg
 from clpipe.analysis.report import NoiseReport
 from clpipe.analysis.statistics import Channel
-from clpipe.analysis.svg import law_svg, noise_svg
 from clpipe.base.errors import ClpipeError
 from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.rendition import DEVELOPMENT, MOSAIC
@@ -84,16 +83,11 @@ def measured(files: Sequence[Blob]) -> NoiseReport:
     Raises:
         ClpipeError: the files cannot be read or compared.
     """
-    with ExitStack() as stack:
-        paths = []
-        for blob in files:
-            data = checked(blob)
-            ending = Path(blob.name).suffix
-            file = stack.enter_context(tempfile.NamedTemporaryFile(suffix=ending))
-            file.write(data)
-            file.flush()
-            paths.append(Path(file.name))
-        picture, truth = (load_picture(path) for path in paths)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder, f"{k}{Path(blob.name).suffix}") for k, blob in enumerate(files)]
+        for path, blob in zip(paths, files, strict=True):
+            path.write_bytes(checked(blob))
+        picture, truth = map(load_picture, paths)
         return measure([picture], truth)
 
 
@@ -144,11 +138,8 @@ def laws(run: Run, problems: list[str]) -> list[Law]:
         fit = next(one.law for one in report.channels if one.name == WHOLE)
         if not fit:
             continue
-        requested_a, requested_b = (
-            number(requested.get("a")),
-            number(requested.get("b")) + other_noise(picture),
-        )
-        found.append(Law(picture.name, fit, requested_a, requested_b, report))
+        a, b = number(requested.get("a")), number(requested.get("b")) + other_noise(picture)
+        found.append(Law(picture.name, fit, a, b, report))
     return found
 
 

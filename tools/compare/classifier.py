@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from clpipe.analysis.signature import LUMA
 from clpipe.base.types import Doubles, Mask
+from clpipe.reference.colour import LUMA
 
 PATCH = 48  # px
 RIDGE, SHRINKAGE = 1.0, 0.1

@@ -37,11 +37,12 @@ import numpy as np
 from PIL import Image
 
 from clpipe.analysis.matching.columns import signature
-from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_mask, luma
+from clpipe.analysis.signature import BRIGHTEST, DARKEST, flat_mask
 from clpipe.base.errors import ClpipeError
 from clpipe.base.types import Array, Floats, Mask
 from clpipe.images.read import read_image
 from clpipe.images.write import write_exr
+from clpipe.reference.colour import luma
 from tools import RENDER, ROOT
 from tools.compare.charts import (
     chart_image,

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clpipe.analysis.signature import luma
 from clpipe.base.types import Doubles
 from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.reference.colour import luma
 from tools.compare.charts import GREY, linear
 
 HAS_HUE = 10.0  # the lowest CIELAB chroma at which hues are compared

@@ -35,7 +35,6 @@ from clpipe.analysis.matching.columns import (
     SKEWS,
     WEAK,
     Noise,
-    autocorrelation,
     figures_of,
 )
 from clpipe.analysis.matching.scenes import Scene, load_scenes
@@ -185,7 +184,7 @@ def median_figures(noises: Sequence[Noise], pairs: Sequence[Pair]) -> dict[str, 
         figures = relative(figures_of(noise, places))
         rows.append([figures[name] for name in SHOWN])
         _, cb, cr = noise.planes
-        rows[-1].append(float(autocorrelation(cb, places)[MAX_LAG, MAX_LAG + 2]))
+        rows[-1].append(float(places.autocorrelation(cb)[MAX_LAG, MAX_LAG + 2]))
         rows[-1].append(over_white(cr, places.bright, COARSE))
     with np.errstate(all="ignore"):
         medians = [

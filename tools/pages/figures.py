@@ -33,10 +33,10 @@ from matplotlib.figure import Figure
 
 from clpipe.analysis.comparison import Comparison, Row, compare
 from clpipe.analysis.comparison_plot import METADATA, STYLE, draw
-from clpipe.analysis.matching.columns import MAX_LAG, spectrum_of
+from clpipe.analysis.matching.columns import MAX_LAG
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
-from clpipe.analysis.spatial import LAGS
+from clpipe.analysis.spatial import LAGS, radial_spectrum
 from clpipe.analysis.statistics import Channel
 from clpipe.base.errors import ClpipeError
 from tools import RENDER
@@ -215,23 +215,20 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
     sheet = Figure(figsize=(7.5, 6), layout="constrained")
     sheet.suptitle(title, fontsize=10)
     (of_raw, of_picture), (lags, spectrum) = sheet.subplots(2, 2)
-    of_raw.plot(raw.curve.mean, raw.curve.sigma, "o", color="black", markersize=4, label="measured")
+    of_raw.plot(
+        raw.intensity.mean, raw.intensity.sigma, "o", color="black", markersize=4, label="measured"
+    )
     if raw.law:
-        y = np.linspace(0, raw.curve.mean[-1], 200)
+        y = np.linspace(0, raw.intensity.mean[-1], 200)
         law = f"√(a y + b), a = {raw.law.a:.3g}, b = {raw.law.b:.2g}"
         of_raw.plot(y, np.sqrt(np.maximum(raw.law.a * y + raw.law.b, 0)), color="black", label=law)
     caption(of_raw, "Raw: noise by intensity", "signal, 1 = white level", "sigma")
     for label, one in found.items():
-        curve, table = one.curve, one.autocorrelation
+        curve, table = one.intensity, one.autocorrelation
         of_picture.plot(curve.mean * LEVELS, curve.sigma * LEVELS, "o-", markersize=3, label=label)
         lags.plot(range(LAGS + 1), table[LAGS, LAGS:], "o-", markersize=3, label=label)
         near = slice(LAGS - MAX_LAG, LAGS + MAX_LAG + 1)
-        power, radius = spectrum_of(table[near, near])
-        rings = np.digitize(radius, edges := np.linspace(0, 0.5, 17))
-        middles = (edges[1:] + edges[:-1]) / 2
-        spectrum.plot(
-            middles, [power[rings == k].mean() for k in range(1, edges.size)], label=label
-        )
+        spectrum.plot(*radial_spectrum(table[near, near], 0.5, 16), label=label)
     caption(of_picture, "Picture: noise by intensity", "luma, levels", "sigma of luma, levels")
     caption(lags, "Picture: autocorrelation of luma", "px to the right", "correlation")
     caption(

@@ -15,12 +15,13 @@ from PIL import Image
 
 import clpipe
 from clpipe.analysis.matching.columns import Figures, signature
-from clpipe.analysis.signature import BIN, MIN_SAMPLES, flat_mask, luma, noise_of
+from clpipe.analysis.signature import BIN, MIN_SAMPLES, flat_mask, noise_of
 from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
+from clpipe.reference.colour import luma
 from tools.pages.comparison_page import COLUMNS, cells, sheet, significant_places
 
 ISOS = (800, 1600, 3200, 6400)

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 import clpipe
 from clpipe.analysis.matching.columns import skewness
-from clpipe.analysis.signature import luma
 from clpipe.base.types import Doubles, Floats
+from clpipe.reference.colour import luma
 from clpipe.reference.transfer import inverse_srgb_curve, srgb_curve
 from clpipe.stages.tone_curve import Standard
 from tools import ROOT

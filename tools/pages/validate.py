@@ -198,11 +198,11 @@ def finished(config: str, iso: float) -> dict[str, float]:
         "chroma, 1 below": lag(chroma, 1, 0),
         "chroma, diagonal": lag(chroma, 1, 1),
         "chroma, 2 right": lag(chroma, 0, 2),
-        "luma left after 2x2": of["Y"].energy_left,
-        "chroma left after 2x2": float(np.mean([of[n].energy_left for n in chroma])),
-        "R-G": report.correlations["R", "G"],
-        "G-B": report.correlations["G", "B"],
-        "R-B": report.correlations["R", "B"],
+        "luma left after 2x2": of["Y"].energy_left_2x2,
+        "chroma left after 2x2": float(np.mean([of[n].energy_left_2x2 for n in chroma])),
+        "R-G": report.correlation["R-G"],
+        "G-B": report.correlation["G-B"],
+        "R-B": report.correlation["R-B"],
     }
 
 

@@ -5,13 +5,15 @@ from its shot noise and its pattern (EMVA 1288, release 4.0, 2021, describes bot
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
-from clpipe.analysis.calibration.dark_figures import sites_of, without_rows
+from clpipe.analysis.calibration.dark_figures import without_rows
+from clpipe.analysis.calibration.fixed_pattern import NO_PIXELS, dark_pattern
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.analysis.report import json_object
 from clpipe.base.types import Doubles, Floats
 
 MIN_TIMES = 2
@@ -27,9 +29,7 @@ class DarkCurrent:
 
     def record(self) -> dict[str, object]:
         """Return the figures as JSON values."""
-        spread = self.spread and asdict(self.spread)
-        times = list(self.times)
-        return {"current_e_per_s": asdict(self.current), "spread": spread, "times_s": times}
+        return json_object(current_e_per_s=self.current, spread=self.spread, times_s=self.times)
 
 
 def dark_current(
@@ -82,16 +82,10 @@ def variances(frames: Floats, sensor: Sensor) -> tuple[Estimate, Estimate]:
     in_time = float(of_pixels.mean())
     freedom = of_pixels.size * (count - 1)
     scatter = float(of_pixels.std()) / of_pixels.size**0.5
-    flat = mean.copy()
-    for site in sites_of(sensor.bayer):
-        part = flat[site]
-        part -= part.mean(axis=0, keepdims=True)
-        part -= part.mean(axis=1, keepdims=True)
-    squares = flat**2
-    pattern = float(squares.mean()) - in_time / count
-    error = float(squares.std()) / squares.size**0.5
+    left = Estimate(in_time / count, 0.0)
+    _, pattern = dark_pattern(mean, left, NO_PIXELS, sensor)
     least = in_time * (2 / freedom) ** 0.5
-    return Estimate(in_time, max(scatter, least)), Estimate(pattern, error)
+    return Estimate(in_time, max(scatter, least)), pattern
 
 
 def slope_of(x: Doubles, estimates: tuple[Estimate, ...]) -> Estimate:

@@ -4,7 +4,7 @@ Frames are (frame, height, width) in DN, of one ISO, exposure time and temperatu
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,9 @@ import numpy as np
 from clpipe.analysis.calibration.fixed_pattern import Pixels
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.analysis.report import json_object
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.reference.cfa import sites
 from clpipe.reference.image import in_blocks
 
 MIN_FRAMES_FOR_LEVELS = 4  # frames needed to measure the scatter of their levels
@@ -28,9 +30,6 @@ JUMPS = 10.0  # relative to the variance of other pixels; a pixel with more coun
 TINY = 1e-9  # DN^2
 # Half width of the correlation of a cubic B-spline, relative to the distance between its knots.
 WIDTH_OF_KNOTS = 0.96
-
-
-FourEstimates = tuple[Estimate, Estimate, Estimate, Estimate]
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Shading:
 class DarkFigures:
     """Figures of dark frames in DN; None if there are too few frames."""
 
-    color_bias: FourEstimates  # R, G in rows with R, G in rows with B, and B
+    color_bias: tuple[Estimate, ...]  # R, G in rows with R, G in rows with B, and B
     black_level_error: Estimate | None
     tukey_lambda: Estimate | None
     banding: Wave | None
@@ -69,25 +68,25 @@ class DarkFigures:
 
     def record(self) -> dict[str, Any]:
         """Return the figures as JSON values."""
-        shading = self.shading and asdict(self.shading.variance.root())
-        return {
-            "color_bias_dn": [asdict(each) for each in self.color_bias],
-            "black_level_error_dn": self.black_level_error and asdict(self.black_level_error),
-            "tukey_lambda": self.tukey_lambda and asdict(self.tukey_lambda),
-            "banding_dn": self.banding and asdict(self.banding),
-            "dark_shading_dn": shading,
-            "dark_shading_length": self.shading and self.shading.length,
-            "rts_share": self.rts_share and asdict(self.rts_share),
-            "rts_amplitude_dn": self.rts_amplitude and asdict(self.rts_amplitude),
-        }
+        shading = self.shading
+        return json_object(
+            color_bias_dn=self.color_bias,
+            black_level_error_dn=self.black_level_error,
+            tukey_lambda=self.tukey_lambda,
+            banding_dn=self.banding,
+            dark_shading_dn=shading and shading.variance.root(),
+            dark_shading_length=shading and shading.length,
+            rts_share=self.rts_share,
+            rts_amplitude_dn=self.rts_amplitude,
+        )
 
 
 def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
     """Return the figures of dark frames, (frame, height, width), without hot pixels."""
     good = hot.outside(dark.shape[1:])
     frames = len(dark)
-    sites = sites_of(sensor.bayer)
-    levels = np.array([[float(f[s].mean(where=good[s])) for s in sites] for f in dark])
+    of_colours = [*sites(sensor.bayer).values()]
+    levels = np.array([[float(f[s].mean(where=good[s])) for s in of_colours] for f in dark])
     mean = dark.mean(axis=0, dtype=np.float64)
     rest = (dark - mean.astype(np.float32)) * np.float32((frames / max(frames - 1, 1)) ** 0.5)
     rows = rest.mean(axis=2, dtype=np.float64)
@@ -95,26 +94,15 @@ def dark_figures(dark: Floats, sensor: Sensor, hot: Pixels) -> DarkFigures:
     share, amplitude = jumps(own, good) if frames >= MIN_FRAMES_FOR_JUMPS else (None, None)
     return DarkFigures(
         color_bias=bias_of(levels, own, sensor.black_level),
-        black_level_error=scatter(levels, rest, sites) if frames >= MIN_FRAMES_FOR_LEVELS else None,
+        black_level_error=scatter(levels, rest, of_colours)
+        if frames >= MIN_FRAMES_FOR_LEVELS
+        else None,
         tukey_lambda=tukey_lambda_of(own, good) if frames > 1 else None,
         banding=banding_wave(rows - rows.mean(axis=1, keepdims=True)) if frames > 1 else None,
-        shading=shading_of(mean, good, sites),
+        shading=shading_of(mean, good, of_colours),
         rts_share=share,
         rts_amplitude=amplitude,
     )
-
-
-def sites_of(pattern: str) -> list[tuple[slice, slice]]:
-    """Return the sites of R, of G in R's rows, of G in B's rows, and of B.
-
-    >>> sites_of("GRBG")[0]
-    (slice(0, None, 2), slice(1, None, 2))
-    """
-    red_row, blue_row = pattern.index("R") // 2, pattern.index("B") // 2
-    green = [k for k, colour in enumerate(pattern) if colour == "G"]
-    of_rows = {k // 2: k for k in green}
-    order = pattern.index("R"), of_rows[red_row], of_rows[blue_row], pattern.index("B")
-    return [(slice(k // 2, None, 2), slice(k % 2, None, 2)) for k in order]
 
 
 def without_rows(rest: Floats) -> Floats:
@@ -126,26 +114,25 @@ def without_rows(rest: Floats) -> Floats:
     return own
 
 
-def bias_of(levels: Doubles, own: Floats, black: float) -> FourEstimates:
+def bias_of(levels: Doubles, own: Floats, black: float) -> tuple[Estimate, ...]:
     """Return the mean errors of the four levels in DN, from (frame, 4) levels."""
     frames = len(levels)
     pixels = float(own.var() or 1.0) / own[0].size * 4
     errors = levels.std(axis=0, ddof=1) / frames**0.5 if frames > 1 else [pixels**0.5] * 4
     pairs = zip(levels.mean(axis=0) - black, errors, strict=True)
-    one, two, three, four = (Estimate(float(value), float(error)) for value, error in pairs)
-    return one, two, three, four
+    return tuple(Estimate(float(value), float(error)) for value, error in pairs)
 
 
-def scatter(levels: Doubles, rest: Floats, sites: Sequence[tuple[slice, slice]]) -> Estimate:
+def scatter(levels: Doubles, rest: Floats, own_sites: Sequence[tuple[slice, slice]]) -> Estimate:
     """Return the variation of the four levels between frames, without that of rows and pixels.
 
     Args:
         levels: (frame, 4), in DN.
         rest: deviations from the mean frame.
-        sites: the sites of the four channels.
+        own_sites: the sites of the four channels.
     """
     total = float(levels.var(axis=0, ddof=1).mean())
-    of_rows = [rest[(slice(None), *site)].mean(axis=2, dtype=np.float64) for site in sites]
+    of_rows = [rest[(slice(None), *site)].mean(axis=2, dtype=np.float64) for site in own_sites]
     explained = float(np.mean([(own.var(axis=1) / own.shape[1]).mean() for own in of_rows]))
     freedom = 4 * (len(levels) - 1)
     return Estimate(total - explained, total * (2 / freedom) ** 0.5).root()
@@ -216,10 +203,12 @@ def banding_wave(rows: Doubles) -> Wave | None:
     return Wave(Estimate(amplitude, float(np.hypot(error, phases))), FINER * height / peak)
 
 
-def shading_of(mean: Doubles, good: Mask, sites: Sequence[tuple[slice, slice]]) -> Shading | None:
+def shading_of(
+    mean: Doubles, good: Mask, own_sites: Sequence[tuple[slice, slice]]
+) -> Shading | None:
     """Return the smooth part of a mean dark frame; None if it has too few blocks."""
     flat = np.where(good, mean, np.nan)
-    for site in sites:
+    for site in own_sites:
         flat[site] -= np.nanmean(flat[site])
     if min(mean.shape) < MIN_BLOCKS * BLOCK:
         return None

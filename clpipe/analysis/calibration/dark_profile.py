@@ -1,11 +1,11 @@
 """A profile's values for dark frames, from calibrations, with their sources; None is unknown."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from clpipe.analysis.calibration.dark_figures import slope_and_offset
-from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.calibration.line_fit import Estimate, weighted
 from clpipe.analysis.calibration.result import Calibration
 
 Sourced = dict[str, tuple[float | None, str]]
@@ -26,35 +26,30 @@ def plus_minus(estimate: Estimate, unit: str = "") -> str:
     return f"{estimate.value:.4g} +- {estimate.error:.2g}{unit}"
 
 
-def weighted(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the mean of estimates, weighted by their inverse squared errors."""
-    weight = np.array([1 / max(e.error, 1e-12) ** 2 for e in estimates])
-    value = float(weight @ [e.value for e in estimates] / weight.sum())
-    return Estimate(value, float(weight.sum() ** -0.5))
-
-
 def dark_values(calibrations: Sequence[Calibration]) -> Sourced:
     """Return the keys of a profile that apply at all ISOs, and the sources of keys by ISO."""
     found = {**_telegraph(calibrations), **_wave(calibrations), **_shading(calibrations)}
+    darks = {c.iso: c.dark for c in calibrations if c.dark}
     for key, unit in (("tukey_lambda", ""), ("black_level_error", "DN")):
-        own = {c.iso: e for c in calibrations if c.dark and (e := getattr(c.dark, key))}
-        each = "; ".join(f"ISO {iso:g} {_signed(e, unit)}" for iso, e in own.items())
-        found[key] = None, f"dark frames: {each}" if own else f"{UNKNOWN}too few dark frames"
-    biased = [c for c in calibrations if c.dark]
-    found["color_bias"] = (
-        None,
-        "means of dark frames by colour, less the black level: "
-        + "; ".join(
-            f"ISO {c.iso:g} {', '.join(_signed(e, '') for e in c.dark.color_bias)} DN"
-            for c in biased
-            if c.dark
-        )
-        if biased
-        else f"{UNKNOWN}no dark frames",
-    )
+        own = {iso: _signed(e, unit) for iso, d in darks.items() if (e := getattr(d, key))}
+        source = f"dark frames: {at_isos(own)}" if own else f"{UNKNOWN}too few dark frames"
+        found[key] = None, source
+    biases = {iso: ", ".join(_signed(e, "") for e in d.color_bias) for iso, d in darks.items()}
+    source = "means of dark frames by colour, less the black level: "
+    source += at_isos({iso: f"{text} DN" for iso, text in biases.items()})
+    found["color_bias"] = None, source if darks else f"{UNKNOWN}no dark frames"
     found |= _current(calibrations)
     found["crosstalk"] = None, f"{UNKNOWN}frames of edges or of one colour would tell it"
     return found
+
+
+def at_isos(texts: Mapping[float, str]) -> str:
+    """Return texts by ISO as one text.
+
+    >>> at_isos({100: "1 DN", 200: "2 DN"})
+    'ISO 100 1 DN; ISO 200 2 DN'
+    """
+    return "; ".join(f"ISO {iso:g} {text}" for iso, text in texts.items())
 
 
 def _signed(estimate: Estimate, unit: str) -> str:

@@ -18,6 +18,7 @@ DARKEST = 0.05  # signal units; the lowest mean of a block for measuring PRNU
 # Largest standard deviation of the scene in a flat block, relative to its mean.
 MAX_UNEVENNESS = 0.03
 MIN_DEVIATION = 0.05  # DN; the smallest assumed deviation of a mean dark frame
+AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)  # the neighbours of a pixel
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class Pixels:
         """Positions as [column, row] and excess in DN, as JSON values."""
         at = np.stack([self.columns, self.rows], axis=1).tolist()
         return {"positions": at, "excess_dn": np.round(self.excess, 2).tolist()}
+
+
+NO_PIXELS = Pixels(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 1.0)
 
 
 def _pixels(mask: Array, excess: Array, seen_on: float) -> Pixels:
@@ -80,10 +84,8 @@ def hot_in_scene(stack: Stack, line: Line) -> Pixels:
     deviation = np.sqrt(line.at(np.maximum(high, 0)) / len(stack.residuals))
     excess = stack.light - high
     out = np.maximum(np.abs(excess), np.abs(stack.light - low))
-    nearby = np.ones((3, 3), bool)
-    nearby[1, 1] = False
     hot = excess > np.maximum(SURE * deviation + (high - low), 0)
-    hot &= excess > 3 * maximum_filter(out, footprint=nearby, mode="mirror")
+    hot &= excess > 3 * maximum_filter(out, footprint=AROUND, mode="mirror")
     return _pixels(stack.used & hot, excess, 1.0)
 
 
@@ -105,12 +107,10 @@ def _extremes(stack: Stack) -> tuple[Floats, Floats]:
     """Return the smallest and largest light in DN of each pixel's 8 neighbours of one colour."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    around = np.ones((3, 3), bool)
-    around[1, 1] = False
     low, high = np.empty_like(stack.light), np.empty_like(stack.light)
     for site in sites(stack.sensor.pattern).values():
-        low[site] = minimum_filter(stack.light[site], footprint=around, mode="mirror")
-        high[site] = maximum_filter(stack.light[site], footprint=around, mode="mirror")
+        low[site] = minimum_filter(stack.light[site], footprint=AROUND, mode="mirror")
+        high[site] = maximum_filter(stack.light[site], footprint=AROUND, mode="mirror")
     return low, high
 
 

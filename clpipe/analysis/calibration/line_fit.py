@@ -8,12 +8,13 @@ the instrument are stored.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clpipe.analysis.report import json_object
 from clpipe.base.types import Array
 
 CLASSES = 2048  # classes of the instrument, the variable that sorts pixels
@@ -40,6 +41,12 @@ class Estimate:
         """Return value and error times a factor, for example to convert the unit."""
         return Estimate(self.value * factor, self.error * abs(factor))
 
+    def over(self, below: "Estimate") -> "Estimate":
+        """Return the quotient of two estimates whose errors are independent."""
+        value = self.value / below.value
+        error = np.hypot(self.error, value * below.error) / below.value
+        return Estimate(value, float(error))
+
     def root(self) -> "Estimate":
         """Return the standard deviation, if this is a variance.
 
@@ -53,6 +60,13 @@ class Estimate:
             return Estimate(0.0, float(np.sqrt(self.error)))
         root = float(np.sqrt(self.value))
         return Estimate(root, self.error / (2 * root))
+
+
+def weighted(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the mean of estimates, weighted by their inverse squared errors."""
+    weight = np.array([max(e.error, 1e-150) ** -2.0 for e in estimates])
+    value = np.average([e.value for e in estimates], weights=weight)
+    return Estimate(float(value), float(weight.sum() ** -0.5))
 
 
 @dataclass(frozen=True)
@@ -81,13 +95,13 @@ class Line:
 
     def record(self, signal_range: float) -> dict[str, Any]:
         """Return a and b in signal units, gain and read noise in DN, each with its error."""
-        return {
-            "a": asdict(self.gain.scaled(1 / signal_range)),
-            "b": asdict(self.floor.scaled(1 / signal_range**2)),
-            "system_gain": asdict(self.gain),
-            "read_noise": asdict(self.floor.root()),
-            "pixels": self.pixels,
-        }
+        return json_object(
+            a=self.gain.scaled(1 / signal_range),
+            b=self.floor.scaled(1 / signal_range**2),
+            system_gain=self.gain,
+            read_noise=self.floor.root(),
+            pixels=self.pixels,
+        )
 
 
 @dataclass(frozen=True)

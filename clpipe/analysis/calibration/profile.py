@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.analysis.calibration.dark_profile import dark_values, plus_minus, weighted
+from clpipe.analysis.calibration.dark_profile import at_isos, dark_values, plus_minus
 from clpipe.analysis.calibration.gain_stages import gain_stages
-from clpipe.analysis.calibration.line_fit import Estimate
+from clpipe.analysis.calibration.line_fit import Estimate, weighted
 from clpipe.analysis.calibration.result import Calibration
 from clpipe.camera.profile import Matrix
 from clpipe.camera.text import profile_text
@@ -114,13 +114,12 @@ def _gain_source(calibrations: Sequence[Calibration]) -> str:
 
 def _line_source(calibrations: Sequence[Calibration], key: str) -> str:
     """Return the source of row or column noise."""
-    estimates = [(c.iso, e) for c in calibrations if (e := getattr(c, key)) is not None]
+    estimates = {c.iso: plus_minus(e, "DN") for c in calibrations if (e := getattr(c, key))}
     if not estimates:
         needs = "two frames" if key == "row_noise" else "dark frames"
         return f"not known without {needs}; assumed to be zero"
-    values = "; ".join(f"ISO {iso:g} {plus_minus(e, 'DN')}" for iso, e in estimates)
     what = "means of rows" if key == "row_noise" else "means of columns of the mean dark frame"
-    return f"{what}, corrected for pixel noise: {values}"
+    return f"{what}, corrected for pixel noise: {at_isos(estimates)}"
 
 
 def _white_in_electrons(lowest: Calibration) -> str:
@@ -140,7 +139,7 @@ def _fixed_pattern(calibrations: Sequence[Calibration]) -> dict[str, tuple[float
     dsnu = {c.iso: c.dsnu.scaled(1 / c.pooled.gain.value) for c in calibrations if c.dsnu}
     result["dsnu"] = (None, "not known without dark frames")
     if dsnu:
-        each = "; ".join(f"ISO {iso:g} {plus_minus(e, 'e-')}" for iso, e in dsnu.items())
+        each = at_isos({iso: plus_minus(e, "e-") for iso, e in dsnu.items()})
         source = f"pixels of the mean dark frame, temporal noise subtracted: {each}"
         result["dsnu"] = _significant(weighted(list(dsnu.values()))), source
     result |= _hot(calibrations)

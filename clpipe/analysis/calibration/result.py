@@ -1,6 +1,6 @@
 """The result of a calibration at one ISO, and its JSON form."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from clpipe.analysis.calibration.dark_current import DarkCurrent
@@ -8,6 +8,7 @@ from clpipe.analysis.calibration.dark_figures import DarkFigures
 from clpipe.analysis.calibration.fixed_pattern import Pixels
 from clpipe.analysis.calibration.line_fit import Bin, Estimate, Line
 from clpipe.analysis.calibration.repeats import Sensor
+from clpipe.analysis.report import json_object
 
 
 @dataclass(frozen=True)
@@ -53,22 +54,21 @@ class Calibration:
     def record(self) -> dict[str, Any]:
         """Return the calibration as JSON values."""
         unit, gain = self.sensor.unit, self.pooled.gain.value
-        electrons = self.dsnu and asdict(self.dsnu.scaled(1 / gain))
-        return {
-            "iso": self.iso,
-            "method": self.method,
-            "scene_frames": self.scene_frames,
-            "dark_frames": self.dark_frames,
-            "share_used": self.used,
-            "pooled": self.pooled.record(unit),
-            "channels": {name: line.record(unit) for name, line in self.lines.items()},
-            "row_noise_dn": self.row_noise and asdict(self.row_noise),
-            "column_noise_dn": self.column_noise and asdict(self.column_noise),
-            "dsnu_e": electrons,
-            "prnu": self.prnu and asdict(self.prnu),
-            "hot_pixels": self.hot and self.hot.record(),
-            "dead_pixels": self.dead and self.dead.record(),
-            "dark": self.dark and self.dark.record(),
-            "dark_current": self.dark_current and self.dark_current.record(),
-            "notes": list(self.notes),
-        }
+        return json_object(
+            iso=self.iso,
+            method=self.method,
+            scene_frames=self.scene_frames,
+            dark_frames=self.dark_frames,
+            share_used=self.used,
+            pooled=self.pooled.record(unit),
+            channels={name: line.record(unit) for name, line in self.lines.items()},
+            row_noise_dn=self.row_noise,
+            column_noise_dn=self.column_noise,
+            dsnu_e=self.dsnu and self.dsnu.scaled(1 / gain),
+            prnu=self.prnu,
+            hot_pixels=self.hot and self.hot.record(),
+            dead_pixels=self.dead and self.dead.record(),
+            dark=self.dark and self.dark.record(),
+            dark_current=self.dark_current and self.dark_current.record(),
+            notes=self.notes,
+        )

@@ -138,27 +138,31 @@ def explained_line(
     return a, b, sets, errors
 
 
+def clipped_normal(u: Values) -> tuple[Values, Values]:
+    """Return mean and deviation of a normal of mean u and deviation 1, clipped to values above 0.
+
+    The mean is `E_m(u) = Phi(u) u + phi(u)`. The variance is `S_m(u)^2 = Phi(u) + phi(u) u -
+    phi(u)^2 + Phi(u) u (u - Phi(u) u - 2 phi(u))` (sec. III-B).
+    """
+    from scipy.special import ndtr
+
+    below, density = ndtr(u), np.exp(-u * u / 2) / np.sqrt(2 * np.pi)
+    mean = below * u + density
+    square = below + density * u - density**2 + below * u * (u - below * u - 2 * density)
+    return mean, np.sqrt(np.maximum(square, 1e-12))
+
+
 def clipped_moments(y: Values, deviation: Values, low: float) -> tuple[Values, Values]:
     """Return mean and deviation of y plus Gaussian noise, clipped to low..1 (sec. III-B).
 
-    Let a normal of mean u and deviation 1 be clipped to values above 0. Its mean is
-    `E_m(u) = Phi(u) u + phi(u)`. Its variance is `S_m(u)^2 = Phi(u) + phi(u) u - phi(u)^2 +
-    Phi(u) u (u - Phi(u) u - 2 phi(u))`. The two ends are combined as if they were far apart.
+    The two ends are combined as if they were far apart.
 
     >>> mean, deviation = clipped_moments(np.array([0.0, 0.5]), np.array([0.1, 0.1]), 0.0)
     >>> mean.round(4).tolist(), deviation.round(4).tolist()
     ([0.0399, 0.5], [0.0584, 0.1])
     """
-    from scipy.stats import norm
-
-    def one_end(u: Values) -> tuple[Values, Values]:
-        below, density = norm.cdf(u), norm.pdf(u)
-        mean = below * u + density
-        square = below + density * u - density**2 + below * u * (u - below * u - 2 * density)
-        return mean, np.sqrt(np.maximum(square, 1e-12))
-
-    from_low, low_deviation = one_end((y - low) / deviation)
-    from_high, high_deviation = one_end((1 - y) / deviation)
+    from_low, low_deviation = clipped_normal((y - low) / deviation)
+    from_high, high_deviation = clipped_normal((1 - y) / deviation)
     mean = low + deviation * from_low + 1 - deviation * from_high - y
     return mean, deviation * low_deviation * high_deviation
 

@@ -1,6 +1,6 @@
 """The figures of EMVA 1288, release 3.1, each with its standard error."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from clpipe.analysis.calibration.line_fit import Estimate
 from clpipe.analysis.emva.moments import Moments, Spatial, Temporal
 from clpipe.analysis.emva.series import NS
+from clpipe.analysis.report import json_value
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles, Mask
 
@@ -75,11 +76,10 @@ class Figures:
 
     def record(self) -> dict[str, Any]:
         """Return the figures as JSON values, each with its error."""
-        plain = ("linearity", "saturated", "fitted")
-        values = {name: value for name, value in vars(self).items() if name not in plain}
-        own = {name: value and asdict(value) for name, value in values.items()}
-        limits = {"least": self.linearity.least, "most": self.linearity.most}
-        return {**own, "linearity_error": {name: asdict(e) for name, e in limits.items()}}
+        values = json_value(self)
+        linearity = values.pop("linearity")
+        del values["saturated"], values["fitted"]
+        return {**values, "linearity_error": {name: linearity[name] for name in ("least", "most")}}
 
 
 def figures(moments: Moments) -> Figures:
@@ -110,18 +110,18 @@ def figures(moments: Moments) -> Figures:
                 f"the {name} does not rise with the exposure; check that all frames are of "
                 "one series"
             )
-    efficiency = _quotient(responsivity, gain)
+    efficiency = responsivity.over(gain)
     dark2, noise_slope = _dark_variance(moments.dark, moments.dark_stack.mean_frame.size)
     dark_dn = dark2.root()
-    dark_noise = _quotient(Estimate(dark2.value - ROUNDING, dark2.error).root(), gain)
+    dark_noise = Estimate(dark2.value - ROUNDING, dark2.error).root().over(gain)
     # (sigma / K + 1/2) / QE, where sigma is in DN. Most of K cancels.
     least = Estimate(dark_dn.value + gain.value / 2, float(np.hypot(dark_dn.error, gain.error / 2)))
-    threshold = _quotient(least, responsivity)
+    threshold = least.over(responsivity)
     # The saturation is within half a step of the exposures.
     photons = bright.photons
     step = float(np.ptp(photons[max(saturated - 1, 0) : saturated + 2])) / 2
     saturation = Estimate(float(photons[saturated]), step / 12**0.5)
-    electrons = _quotient(saturation, _quotient(gain, responsivity))
+    electrons = saturation.over(gain.over(responsivity))
     current, of_noise = _dark_current(moments.dark, gain, noise_slope)
     return Figures(
         system_gain=gain,
@@ -133,7 +133,7 @@ def figures(moments: Moments) -> Figures:
         saturation=saturation,
         saturation_electrons=electrons,
         snr_max=electrons.root(),
-        dynamic_range=_quotient(saturation, threshold),
+        dynamic_range=saturation.over(threshold),
         linearity=_linearity(moments, saturated),
         dsnu=_dsnu(moments.dark_stack, gain),
         prnu=_prnu(moments.bright_stack, moments.dark_stack),
@@ -181,13 +181,6 @@ def _line(x: Doubles, y: Doubles) -> tuple[Estimate, Estimate]:
     return Estimate(float(slope), float(slope_error)), Estimate(float(offset), float(offset_error))
 
 
-def _quotient(above: Estimate, below: Estimate) -> Estimate:
-    """Return the quotient of two estimates whose errors are independent."""
-    value = above.value / below.value
-    error = np.hypot(above.error, value * below.error) / below.value
-    return Estimate(value, float(error))
-
-
 def _dark_variance(dark: Temporal, pixels: int) -> tuple[Estimate, Estimate | None]:
     """Return the variance without light at no exposure, DN^2, and its slope, DN^2/ns.
 
@@ -211,8 +204,8 @@ def _dark_current(
         return None, None
     of_mean = _line(dark.time / 1e6, dark.mean)[0].scaled(1e-6)
     return (
-        _quotient(of_mean.scaled(NS), gain),
-        _quotient(noise_slope.scaled(NS / gain.value), gain),
+        of_mean.scaled(NS).over(gain),
+        noise_slope.scaled(NS / gain.value).over(gain),
     )
 
 
@@ -240,7 +233,7 @@ def _linearity(moments: Moments, saturated: int) -> Linearity:
 def _dsnu(dark: Spatial, gain: Estimate) -> NonUniformity:
     """Return the deviation of pixels without light, e-."""
     parts = (dark.variance, *dark.parts)
-    return NonUniformity(*(_quotient(part.root(), gain) for part in parts))
+    return NonUniformity(*(part.root().over(gain) for part in parts))
 
 
 def _prnu(bright: Spatial, dark: Spatial) -> NonUniformity:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from clpipe.analysis.calibration.single_image import clipped_normal
 from clpipe.base.types import Doubles
 
 COARSE = 1.0  # DN; if noise is larger, rounding only adds 1/12 DN^2
@@ -82,15 +83,10 @@ def noisiest_light(gain: float, read_noise: float, prnu: float, full: float) -> 
     >>> 0.9 < noisiest_light(0.1, 2.0, 0.005, 4000) / 40000 < 1
     True
     """
-    from scipy.special import ndtr
-
     light = SEARCH_RANGE[:, None] * full * np.maximum(1 + prnu * NODES, 0)
     sigma = np.sqrt(gain * light + read_noise**2)
-    u = (full - light) / sigma
-    density, below = np.exp(-u * u / 2) / np.sqrt(2 * np.pi), ndtr(u)
-    # The variance of a standard normal that is clipped at u.
-    cut = -density + u * (1 - below)
-    variance = sigma * sigma * (below - u * density + u * u * (1 - below) - cut * cut)
+    _, clipped = clipped_normal((full - light) / sigma)
+    variance = np.square(sigma * clipped)
     return float(SEARCH_RANGE[np.argmax(variance @ NODE_WEIGHTS)] * full / gain)
 
 

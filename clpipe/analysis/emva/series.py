@@ -11,7 +11,7 @@ Each line begins with a letter; ``#`` begins a comment:
 Two frames are for temporal figures, more are a stack for spatial ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -97,50 +97,45 @@ class Series:
         return pixels
 
 
-class _Lines:
-    """Reads the lines of a text one by one, with their numbers."""
+@dataclass(frozen=True)
+class _Line:
+    """A line of a text: its number, letter and words."""
 
-    def __init__(self, path: Path, text: str) -> None:
-        self._path = path
-        numbered = enumerate(text.splitlines(), 1)
-        self._lines = [(n, line.strip()) for n, line in numbered if line.split("#")[0].strip()]
-        self._at = 0
+    path: Path
+    number: int
+    letter: str
+    words: Sequence[str]
 
-    def next(self, only: str = "") -> tuple[int, list[str]] | None:
-        """Return number and words of the next line; None at the end, or at another letter."""
-        if self._at == len(self._lines):
-            return None
-        number, line = self._lines[self._at]
-        letter, *rest = line.split(maxsplit=1)
-        form = FORMS.get(letter)
-        if form is None:
-            letters = ", ".join(FORMS)
-            raise self.error(
-                number, f"found {one_line(line)!r}; expected a line that begins with {letters} or #"
-            )
-        if only and letter != only:
-            return None
-        words = rest if letter == "i" else line.split()[1:]
-        if len(words) != len(form.split()) - 1:
-            raise self.error(number, f"found {one_line(line)!r}; expected {form}")
-        self._at += 1
-        return number, [letter, *words]
+    def error(self, message: str) -> RequestError:
+        return RequestError(f"{self.path}, line {self.number}: {message}")
 
-    def error(self, number: int, message: str) -> RequestError:
-        return RequestError(f"{self._path}, line {number}: {message}")
-
-    def number(
-        self, number: int, word: str, name: str, low: float, high: float, whole: bool = False
-    ) -> float:
-        """Return a number in a line, whose decimal separator may be a comma, or a whole number."""
+    def value(self, place: int, name: str, low: float, high: float, whole: bool = False) -> float:
+        """Return the number in a word, whose decimal separator may be a comma."""
+        word = self.words[place]
         try:
             value = whole_number(word) if whole else float(word.replace(",", "."))
         except ValueError:
             value = np.nan
         if not low <= value <= high:
             allowed = f"{low:g} to {high:g}"
-            raise self.error(number, f"{name}: found {one_line(word)!r}; allowed: {allowed}")
+            raise self.error(f"{name}: found {one_line(word)!r}; allowed: {allowed}")
         return value
+
+
+def _lines(path: Path) -> Iterator[_Line]:
+    """Yield the lines of a text without comments, after checking their forms."""
+    for number, text in enumerate(read_named_text(str(path), path).splitlines(), 1):
+        if not text.split("#")[0].strip():
+            continue
+        letter, *rest = text.split(maxsplit=1)
+        line = _Line(path, number, letter, rest if letter == "i" else text.split()[1:])
+        form, found = FORMS.get(letter), one_line(text.strip())
+        if form is None:
+            letters = ", ".join(FORMS)
+            raise line.error(f"found {found!r}; expected a line that begins with {letters} or #")
+        if len(line.words) != len(form.split()) - 1:
+            raise line.error(f"found {found!r}; expected {form}")
+        yield line
 
 
 def read_series(path: Path) -> Series:
@@ -149,59 +144,45 @@ def read_series(path: Path) -> Series:
     Raises:
         RequestError: the text cannot be read, a line is wrong, or required frames are missing.
     """
-    lines = _Lines(path, read_named_text(str(path), path))
     size: list[int] = []
-    exposures: dict[tuple[float, float, bool], Exposure] = {}
-    while found := lines.next():
-        number, (letter, *words) = found
-        if letter == "n":
+    groups: list[tuple[_Line, list[Path]]] = []  # a line b or d, and the frames that follow
+    is_open = False  # whether frames may follow
+    for line in _lines(path):
+        if line.letter == "i":
+            if not is_open:
+                raise line.error("this frame belongs to no exposure; add a line b or d before it")
+            groups[-1][1].append(path.parent / line.words[0].rstrip().replace("\\", "/"))
+            continue
+        is_open = line.letter in "bd"
+        if is_open:
+            groups.append((line, []))
+        elif line.letter == "n":
             if size:
-                raise lines.error(number, "this is the second line n; keep only one")
+                raise line.error("this is the second line n; keep only one")
             limits = (("bits", 1, MAX_BITS), ("side", *SIDES), ("side", *SIDES))
-            size = [
-                int(lines.number(number, word, *limit, whole=True))
-                for word, limit in zip(words, limits, strict=True)
-            ]
-        elif letter == "i":
-            raise lines.error(
-                number, "this frame belongs to no exposure; add a line b or d before it"
+            size = [int(line.value(k, *limit, whole=True)) for k, limit in enumerate(limits)]
+    exposures: dict[tuple[float, float, bool], Exposure] = {}
+    for line, frames in groups:
+        own = _exposure(line, frames)
+        other = exposures.setdefault((own.time, own.photons, len(own.frames) == PAIR), own)
+        if other is not own:
+            raise line.error(
+                f"this line repeats the exposure of line {other.line}; remove one of the two lines"
             )
-        elif letter in "bd":
-            own = _exposure(lines, number, words, path.parent)
-            key = own.time, own.photons, len(own.frames) == PAIR
-            if key in exposures:
-                raise lines.error(
-                    number,
-                    f"this line repeats the exposure of line {exposures[key].line}; remove one "
-                    "of the two lines",
-                )
-            exposures[key] = own
     if not size:
         raise RequestError(f"{path}: the line {FORMS['n']} is missing")
     return _checked(path, size, list(exposures.values()))
 
 
-def _exposure(lines: _Lines, number: int, words: Sequence[str], folder: Path) -> Exposure:
-    """Return the exposure of a line b or d, and of the frames that follow it.
-
-    Args:
-        lines: the lines of the text.
-        number: the number of the line.
-        words: the words of the line: a time and, with light, photons.
-        folder: the folder of the text.
-    """
-    time = lines.number(number, words[0], "time", 0, 1e15)
-    photons = [lines.number(number, word, "photons", 0, 1e12) for word in words[1:]]
-    if photons == [0.0]:
-        raise lines.error(number, "photons: found 0; for frames without light, use a line d")
-    frames = []
-    while frame := lines.next(only="i"):
-        frames.append(folder / frame[1][1].replace("\\", "/"))
+def _exposure(line: _Line, frames: Sequence[Path]) -> Exposure:
+    """Return the exposure of a line b or d, and of the frames that follow it."""
+    time = line.value(0, "time", 0, 1e15)
+    photons = line.value(1, "photons", 0, 1e12) if line.letter == "b" else 0.0
+    if line.letter == "b" and not photons:
+        raise line.error("photons: found 0; for frames without light, use a line d")
     if len(frames) < PAIR:
-        raise lines.error(
-            number, f"found {len(frames)} frames of this exposure; at least {PAIR} are needed"
-        )
-    return Exposure(time, sum(photons), tuple(frames), number)
+        raise line.error(f"found {len(frames)} frames of this exposure; at least {PAIR} are needed")
+    return Exposure(time, photons, tuple(frames), line.number)
 
 
 def _checked(path: Path, size: Sequence[int], exposures: Sequence[Exposure]) -> Series:

@@ -9,7 +9,6 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -43,10 +42,6 @@ class Ambiguity:
             f"{' and '.join(self.names)} cannot be distinguished: the correlation of their errors "
             f"is {self.correlation:+.2f}, so other values of both fit about as well"
         )
-
-    def record(self) -> dict[str, Any]:
-        """Return the ambiguity as JSON values."""
-        return {"names": list(self.names), "correlation": self.correlation}
 
 
 def ambiguities(search: Search, found: Candidate) -> tuple[Ambiguity, ...]:

@@ -19,25 +19,17 @@ from clpipe.analysis.signature import (
     BIN,
     DARK,
     DARKEST,
-    LUMA,
     MIN_SAMPLES,
-    chroma,
     flat_mask,
-    luma,
     noise_of,
 )
-from clpipe.analysis.spatial import energy_left
+from clpipe.analysis.spatial import autocorrelation, count_pairs, energy_left, spectrum_of
 from clpipe.base.types import Array, Doubles, Floats, Mask
+from clpipe.reference.colour import LUMA, luma, rgb_to_ycbcr
 
 MAX_LAG = 6  # px, the longest lag
 # Cycles per pixel; the edges of bands. The corner of the spectrum is at 0.71.
-BANDS = (
-    0.0,
-    0.125,
-    0.25,
-    0.375,
-    0.75,
-)
+BANDS = 0.0, 0.125, 0.25, 0.375, 0.75
 LEVELS = (12, 24, 40, 64, 96, 128, 160, 192, 226)  # edges of the luma bins
 RELATIVE_TO = 64  # the luma bin to which noise by intensity is relative, between cameras
 BLOCK = 32  # px; the side of a block
@@ -132,9 +124,15 @@ class ValidPixels:
 
     @cached_property
     def pairs(self) -> Doubles:
-        """The number of bright pairs at each lag, (13, 13); NaN if there is none."""
-        count = products(self.bright[None].astype(np.float64)).round()
-        return np.where(count > 0, count, np.nan)
+        """The number of bright pairs at each lag, (13, 13)."""
+        return count_pairs(self.bright, MAX_LAG)
+
+    def autocorrelation(self, plane: Doubles) -> Doubles:
+        """Return the autocorrelation of noise, (frame, height, width), in the bright pixels.
+
+        It is (13, 13), with lag 0 in the middle.
+        """
+        return autocorrelation((plane * self.bright).astype(np.float32), self.pairs)
 
 
 Figures = dict[str, float]  # figures by names of COLUMNS; NaN if a figure cannot be computed
@@ -154,8 +152,8 @@ class Noise:
     @cached_property
     def planes(self) -> tuple[Doubles, Doubles, Doubles]:
         """Luma, Cb and Cr, (frame, height, width) each."""
-        y = self.rgb @ LUMA.astype(self.rgb.dtype)
-        return y, *chroma(self.rgb, y)
+        y, cb, cr = np.ascontiguousarray(np.moveaxis(rgb_to_ycbcr(self.rgb), -1, 0))
+        return y, cb, cr
 
 
 def noise_of_frames(
@@ -184,7 +182,7 @@ def figures_of(noise: Noise, places: ValidPixels) -> Figures:
         return found
     names = ("right", "below", "diagonal", "two_right", "two_below", *LONG_LAGS_RIGHT)
     y, cb, cr = noise.planes
-    luma_map, *chroma_maps = (autocorrelation(plane, places) for plane in (y, cb, cr))
+    luma_map, *chroma_maps = map(places.autocorrelation, (y, cb, cr))
     chroma_map = (chroma_maps[0] + chroma_maps[1]) / 2
     samples = noise.rgb[:, mask].reshape(-1, 3)
     power = np.einsum("ni,nj->ij", samples, samples, dtype=np.float64) / len(samples)
@@ -235,8 +233,8 @@ def flat_places(mean: Array, mask: Mask | None = None) -> ValidPixels:
     return ValidPixels(mask, luma(mean), saturated=saturated_of(mean, mask))
 
 
-LAGS = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1), "two_right": (0, 2)}
-LAGS["two_below"] = (2, 0)
+LAGS = {"right": (0, 1), "below": (1, 0), "diagonal": (1, 1)}
+LAGS |= {"two_right": (0, 2), "two_below": (2, 0)}
 LONG_LAGS_RIGHT = {f"right_{lag}": (0, lag) for lag in LONG_LAGS}
 LAGS |= LONG_LAGS_RIGHT
 
@@ -245,53 +243,6 @@ def named_lags(table: Doubles, prefix: str, names: Sequence[str]) -> Figures:
     """Return named lags of a map of autocorrelation."""
     places = {name: (MAX_LAG + LAGS[name][0], MAX_LAG + LAGS[name][1]) for name in names}
     return {f"{prefix}{name}": float(table[place]) for name, place in places.items()}
-
-
-def products(planes: Doubles) -> Doubles:
-    """Return the sums of products at all lags up to 6 px, (13, 13) with lag 0 in the middle.
-
-    They are computed from the power spectrum (Wiener and Khinchin). Matrix products would need no
-    second transform, but BLAS takes longer to start its threads.
-
-    Args:
-        planes: (frame, height, width), which are 0 beyond their borders.
-    """
-    from scipy import fft
-
-    height, width = (fft.next_fast_len(size + MAX_LAG, real=True) for size in planes.shape[1:])
-    waves = fft.rfft2(planes.astype(np.float32), (height, width))
-    power = (waves.real**2 + waves.imag**2).sum(0)
-    steps = np.arange(-MAX_LAG, MAX_LAG + 1)
-    rows = fft.ifft(power, axis=0)[steps]
-    return np.asarray(fft.irfft(rows, width)[:, steps], np.float64)
-
-
-def autocorrelation(plane: Doubles, places: ValidPixels) -> Doubles:
-    """Return the autocorrelation of noise at lags up to 6 px, (13, 13) with lag 0 in the centre.
-
-    It is computed over all frames. Opposite lags are averaged.
-
-    Args:
-        plane: (frame, height, width).
-        places: the valid pixels.
-    """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        covariance = products(plane * places.bright) / (places.pairs * len(plane))
-        return np.asarray(covariance / covariance[MAX_LAG, MAX_LAG])
-
-
-def spectrum_of(table: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the power spectrum of an autocorrelation, and the frequencies, (64, 64) each.
-
-    It is the transform of the autocorrelation with a triangular window (Blackman and Tukey, 1958;
-    the window is Bartlett's). Independent noise has 1 everywhere. Frequencies are in cycles per
-    pixel.
-    """
-    steps, frequency = np.arange(-MAX_LAG, MAX_LAG + 1), np.fft.fftfreq(64)
-    fall = 1 - np.abs(steps) / (MAX_LAG + 1)
-    waves = np.exp(-2j * np.pi * np.outer(frequency, steps))
-    spectrum = (waves @ (np.nan_to_num(table) * np.outer(fall, fall)) @ waves.T).real
-    return spectrum, np.hypot(frequency[:, None], frequency[None])
 
 
 def bands(table: Doubles) -> Figures:

@@ -1,7 +1,7 @@
 """The result of a search: columns inside and outside the searched areas, and a configuration."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from clpipe.analysis.matching.edges import Sharpness, as_sharp
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, Search, Target, target_at, target_of
 from clpipe.analysis.matching.space import DEVELOPMENT, TONE
-from clpipe.analysis.report import json_number
+from clpipe.analysis.report import json_object
 from clpipe.base.files import write_new
 from clpipe.base.types import Mask
 from clpipe.chain.settings import Settings, overlay
@@ -44,6 +44,12 @@ class Row:
     def relative(self) -> bool:
         """Whether the residual is a share of theirs."""
         return COLUMNS[self.name].relative
+
+    def record(self) -> dict[str, Any]:
+        """Return the figures as JSON values."""
+        return json_object(
+            theirs=self.theirs, ours=self.ours, residual=self.residual, error=self.error
+        )
 
 
 class Compared(NamedTuple):
@@ -103,24 +109,24 @@ class Match:
 
     def record(self) -> dict[str, Any]:
         """Return the match as JSON values, with null for columns that cannot be compared."""
-        return {
-            "settings": self.settings.record(),
-            "searched": dict(self.numbers),
-            "evaluations": self.evaluations,
-            "scenes": [scene.name for scene in self.scenes.each],
-            "notes": list(self.scenes.notes),
-            "ambiguities": [each.record() for each in self.ambiguities],
-            "sharpness": asdict(self.sharpness) if self.sharpness else None,
-            "ended_by_range": ended_by(self.settings, self.numbers) or None,
-            "columns": {
+        return json_object(
+            settings=self.settings.record(),
+            searched=self.numbers,
+            evaluations=self.evaluations,
+            scenes=[scene.name for scene in self.scenes.each],
+            notes=self.scenes.notes,
+            ambiguities=self.ambiguities,
+            sharpness=self.sharpness,
+            ended_by_range=ended_by(self.settings, self.numbers) or None,
+            columns={
                 seen.name: {
                     "relative": seen.relative,
-                    "searched": row_record(seen),
-                    "not_searched": row_record(unseen),
+                    "searched": seen.record(),
+                    "not_searched": unseen.record(),
                 }
                 for seen, unseen in zip(self.seen, self.unseen, strict=True)
             },
-        }
+        )
 
 
 def ended_by(settings: Settings, numbers: Mapping[str, float]) -> str:
@@ -137,11 +143,6 @@ def ended_by(settings: Settings, numbers: Mapping[str, float]) -> str:
                 f"have {which} noise than its profile has at any ISO"
             )
     return ""
-
-
-def row_record(row: Row) -> dict[str, float | None]:
-    """Return the figures of a row as JSON values."""
-    return {key: json_number(getattr(row, key)) for key in ("theirs", "ours", "residual", "error")}
 
 
 def measured(search: Search, found: Candidate) -> Match:

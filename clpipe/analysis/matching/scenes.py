@@ -1,7 +1,5 @@
 """Reads, checks, crops and masks the pictures of a camera to match."""
 
-import glob
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,13 +18,15 @@ from clpipe.analysis.matching.columns import (
     block_numbers,
     noise_of_frames,
 )
-from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask, luma
+from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.base.url_text import local
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
 from clpipe.images.read import read_finished
+from clpipe.inputs.find import glob_files
+from clpipe.reference.colour import luma
 from clpipe.reference.image import in_blocks
 
 MAX_UNCROPPED = 640  # px; larger pictures are reduced to their flattest crops of CROP x CROP
@@ -112,21 +112,18 @@ class Scenes:
     notes: tuple[str, ...]
 
 
-def expand(patterns: Sequence[str], what: str) -> list[Path]:
+def expand(patterns: Sequence[str]) -> list[Path]:
     """Return the files of names and globs, in order. An existing file is never read as a glob.
 
     Raises:
-        RequestError: a glob matches no file.
+        RequestError: a glob matches no file, or a file is missing.
     """
     found: list[Path] = []
     for pattern in map(local, patterns):
-        is_glob = glob.has_magic(pattern) and not os.path.exists(pattern)
-        names = sorted(glob.glob(pattern)) if is_glob else [pattern]
-        if not names:
-            raise RequestError(f"{what}: no file matches {pattern}; correct the pattern")
-        if not is_glob:
+        names = glob_files(pattern)
+        if names is None:
             check_input(Path(pattern))
-        found += map(Path, names)
+        found += map(Path, names or [pattern])
     return found
 
 
@@ -142,7 +139,7 @@ def load_scenes(frames: Sequence[str], means: Sequence[str]) -> Scenes:
         RequestError: there are too few frames, or the pictures do not belong together.
         ImageError: a file cannot be read, or has too few flat places.
     """
-    paths, mean_paths = expand(frames, "FRAME"), expand(means, "--mean")
+    paths, mean_paths = expand(frames), expand(means)
     pictures = [read_picture(path) for path in paths]
     if not mean_paths and len(paths) == 1:
         raise RequestError(
