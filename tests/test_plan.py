@@ -157,3 +157,9 @@ def test_a_kernel_does_not_depend_on_names_slots_places_or_the_border():
     other = plan_of(**alike, denoise=own, denoise_2=own, denoise_3=wide, encode=False, final=True)
     assert other.border > plain.border
     assert blur(other, 0).source == first.source
+
+
+def test_numbers_that_numpy_computed_are_written_as_numbers(clpipe):
+    """NumPy writes its own floats with their type, which TOML does not read."""
+    text = clpipe("plan", "--toml", "--iso", "3200").stdout
+    assert "# noise = 0.00" in text and "np." not in text

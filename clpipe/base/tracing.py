@@ -10,12 +10,14 @@ import operator
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from types import FunctionType, MethodType
 from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
+
+from clpipe.base.types import plain_float
 
 T = TypeVar("T")
 Repeat = Callable[[Sequence[Any]], Any]
@@ -86,9 +88,23 @@ class Traced:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         scalars = all(isinstance(each, (Traced, *NUMBER_TYPES)) for each in inputs)
         if scalars and method == "__call__" and ufunc.nout == 1 and not options:
-            return call(UFUNCS.get(ufunc, ufunc), *inputs)
+            return call(UFUNCS.get(ufunc) or scalar_function(ufunc), *inputs)
         plain = [float(each) if isinstance(each, Traced) else each for each in inputs]
         return getattr(ufunc, method)(*plain, **options)
+
+
+@cache
+def scalar_function(ufunc: Any) -> Callable[..., Any]:
+    """Return a function of NumPy with Python floats as results, where NumPy has its float64.
+
+    >>> scalar_function(np.sqrt)(0.25)
+    0.5
+    """
+
+    def function(*arguments: Any) -> Any:
+        return plain_float(ufunc(*arguments))
+
+    return function
 
 
 def _calculation(function: Callable[..., Any], swapped: bool = False) -> Callable[..., Any]:

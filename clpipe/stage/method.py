@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, PrivateAttr
 
-from clpipe.base.types import Floats
+from clpipe.base.types import Floats, plain_float
 from clpipe.reference.geometry import NO_MARGINS, Geometry, Margins
 from clpipe.stage.context import Context, ReferenceContext
 from clpipe.stage.passes import Arguments, Kind, Pass
@@ -215,7 +215,11 @@ class Method(BaseModel):
 
     def with_defaults(self, **values: Any) -> Self:
         """Return a copy in which ``values`` replace the parameters that are None."""
-        missing = {k: v for k, v in values.items() if getattr(self, k) is None and v is not None}
+        missing = {
+            name: plain_float(value)
+            for name, value in values.items()
+            if getattr(self, name) is None and value is not None
+        }
         return self.model_copy(update=missing) if missing else self
 
 
