@@ -12,9 +12,9 @@ from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.types import Array
-from clpipe.images.layers import MAX_PARTS, PictureLocation, mosaic_channel, picture_channels
+from clpipe.images.layers import PictureLocation, mosaic_channel, picture_channels
 from clpipe.images.openexr import read_channels
-from clpipe.images.openimageio import damage_text, open_image, read_with_pillow
+from clpipe.images.openimageio import damage_text, open_image, parts_of, read_with_pillow
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size, display_window
 from clpipe.reference.geometry import Margins
 
@@ -139,9 +139,7 @@ def holds_mosaic(path: Path) -> bool:
         ImageError: the file is missing, empty, damaged or not an image.
     """
     with open_image(path) as file:
-        parts: list[list[str]] = []
-        while len(parts) < MAX_PARTS and file.seek_subimage(len(parts), 0):
-            parts.append(list(file.spec().channelnames))
+        parts = [list(spec.channelnames) for _, _, spec in parts_of(file)]
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
 
