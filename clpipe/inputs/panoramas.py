@@ -13,7 +13,7 @@ from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.companions import SEPARATORS
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.poses import stem_of
 from clpipe.inputs.render_cameras import read_views
 from clpipe.inputs.subframes import check_values, with_file_records

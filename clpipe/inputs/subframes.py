@@ -15,7 +15,7 @@ from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.sequences import by_pattern, numbers_of
 from clpipe.reference.geometry import Margins
 from clpipe.stage import Span, StageRole

@@ -17,7 +17,7 @@ from clpipe.engine.state import has_state
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.inputs.carry import CarriedLayers
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.motion import motion_records, row_times
 from clpipe.outputs.patches import Patch, metadata_of

@@ -13,7 +13,7 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
 from clpipe.base.reading import check_exists
 from clpipe.images.passes import find_layers, layer_kind
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.leaves import dead_leaves, read_palette, write_leaves
 from clpipe.scenes.record import read_record, write_record
