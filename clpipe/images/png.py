@@ -5,15 +5,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from clpipe.images import colour_names
+
 MAGIC = b"\x89PNG\r\n\x1a\n"
 MAX_CHUNKS = 1000  # chunks before the first chunk of samples
 
 # Codes of ITU-T H.273 (2024). Table 2: x and y of red, green, blue and white. Table 3: curves.
 PRIMARIES = {
-    1: (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
-    9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+    1: colour_names.PRIMARIES["rec709"],
+    9: colour_names.PRIMARIES["rec2020"],
     11: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351),
-    12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+    12: colour_names.PRIMARIES["p3d65"],
 }
 CURVES = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 8: "linear", 13: "srgb", 16: "PQ", 18: "HLG"}
 SRGB_GAMMA = 1 / 2.2

@@ -21,7 +21,7 @@ from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import ARRAY_SEPARATOR, D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS, check_size
-from clpipe.images.tags import DATE
+from clpipe.images.tags import DATE, FLIPS
 from clpipe.images.tiff import read_directories
 from clpipe.images.two_lights import TEMPERATURES, Light, camera_to_srgb
 from clpipe.images.vocabularies import dng_warnings, raw_compression
@@ -39,7 +39,7 @@ MAX_GAIN = 8.0  # largest white balance gain; the smallest is its inverse
 
 # Converts LibRaw's flip to EXIF's orientation. The flip is a sum of 1 (mirror horizontally),
 # 2 (mirror vertically) and 4 (then transpose).
-ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
+ORIENTATIONS = {int(np.dot(flips, (1, 2, 4))): number for number, flips in FLIPS.items()}
 
 # The bytes before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
