@@ -15,9 +15,14 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.cpu_time import CpuTimer
+from clpipe.base.reading import read_start
 from clpipe.base.types import Array
-from clpipe.images.exr_header import read_header
 
+# The types that are read, by OpenImageIO's names.
+DTYPES: dict[str, np.dtype[Any]] = {"half": np.dtype(np.float16), "float": np.dtype(np.float32)}
+# OpenEXR decompresses an attribute of this type, to up to a thousand times its size.
+MANIFEST = b"\0idmanifest\0"
+HEADER_BYTES = 1 << 16  # in which the attribute is searched
 MAX_EXTRA = 2  # the memory of all channels, relative to the memory of the requested channels
 
 
@@ -40,33 +45,33 @@ def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> An
         )
 
 
-def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> Array | None:
+def read_channels(path: Path, file: Any, indices: Sequence[int]) -> Array | None:
     """Return channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
 
     R, G and B without alpha are interleaved in memory. For other channels, the array is a view of
     consecutive planes.
 
     Args:
-        path: the file, whose header OpenImageIO has accepted.
-        names: the names of the channels in the file.
-        shape: rows and columns of its data window.
+        path: the file.
+        file: the open ``oiio.ImageInput``, at its first part.
+        indices: the numbers of the channels.
 
     Returns:
-        The samples; None if OpenImageIO must read the file, because it is unusual or damaged, or
-        other channels would take too much time and memory.
+        The samples; None if OpenImageIO must read the file, because it has several parts or is
+        damaged, or because other channels would take too much time and memory.
     """
-    header = read_header(path, shape)
-    if header is None or not header.channels.keys() >= set(names):
+    spec = file.spec()
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    types = {str(formats[i]) for i in indices}
+    dtype = DTYPES.get(types.pop()) if len(types) == 1 else None
+    stored = sum(each.size() for each in formats)
+    if dtype is None or stored > MAX_EXTRA * len(indices) * dtype.itemsize:
         return None
-    types = header.channels
-    dtype = types[names[0]]
-    size = sum(each.itemsize for each in types.values())
-    if {types[name] for name in names} != {dtype} or dtype.kind != "f":
+    if _has_several_parts(file) or MANIFEST in read_start(path, HEADER_BYTES):
         return None
-    if size > MAX_EXTRA * len(names) * dtype.itemsize:
-        return None
+    names = [spec.channelnames[i] for i in indices]
     layer = names[0].removesuffix("R")
-    is_rgb = list(names) == [layer + colour for colour in "RGB"] and layer + "A" not in types
+    is_rgb = names == [layer + colour for colour in "RGB"] and layer + "A" not in spec.channelnames
     try:
         channels = open_exr(path, separate=not is_rgb).parts[0].channels
         if is_rgb:
@@ -75,7 +80,16 @@ def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> A
             pixels = _join_planes(channels, names, dtype)
     except Exception:  # OpenImageIO reports the error
         return None
-    return pixels if (pixels.shape, pixels.dtype) == ((*shape, len(names)), dtype) else None
+    shape = spec.height, spec.width, len(names)
+    return pixels if (pixels.shape, pixels.dtype) == (shape, dtype) else None
+
+
+def _has_several_parts(file: Any) -> bool:
+    """Return whether an open file has several parts; it is at its first one."""
+    found = file.seek_subimage(1, 0)
+    file.seek_subimage(0, 0)
+    file.geterror()  # clears the error: the second part need not exist
+    return bool(found)
 
 
 def _join_planes(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:

@@ -85,8 +85,7 @@ def read_part(
     type_ = types.pop() if is_integer else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
     pixels = None
     if file.format_name() == "openexr" and not is_integer:
-        names = [spec.channelnames[i] for i in channels]
-        pixels = read_channels(path, names, (spec.height, spec.width))
+        pixels = read_channels(path, file, channels)
     if pixels is None:
         pixels = read_samples(path, file, location.part, channels, type_)
     if is_integer:
