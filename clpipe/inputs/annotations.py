@@ -60,6 +60,15 @@ def read_json(path: Path) -> Any:
         ) from None
 
 
+def are_numbers(values: Any, count: int | None = None) -> bool:
+    """Return whether a value is a list of coordinates; None allows any count."""
+    return (
+        isinstance(values, list)
+        and count in (None, len(values))
+        and all(type(v) in (int, float) and abs(v) <= MAX_COORDINATE for v in values)
+    )
+
+
 def reject(path: Path, place: str, found: Any, expected: str) -> NoReturn:
     """Reject a value of an annotation file.
 

@@ -13,10 +13,10 @@ from typing import Any
 from clpipe.base.text import whole_number
 from clpipe.inputs.annotation_keys import BOP, name_unknown
 from clpipe.inputs.annotations import (
-    MAX_COORDINATE,
     MAX_PIXELS,
     AnnotatedRender,
     Record,
+    are_numbers,
     read_json,
     reject,
 )
@@ -91,7 +91,7 @@ def read_bop(path: Path) -> Bop:
         renders.append(AnnotatedRender(f"{image:0{DIGITS}d}", None, found))
     for image, camera in cameras.items():
         matrix = camera.get("cam_K", [0] * 9) if isinstance(camera, dict) else None
-        if not isinstance(matrix, list) or len(matrix) != 9 or not all(map(_is_number, matrix)):
+        if not are_numbers(matrix, 9):
             reject(path.with_name(CAMERAS), f"{image}.cam_K", matrix, "nine numbers")
     objects_of_all = [each for render in renders for each in render.content]
     records = [record for each in objects_of_all for record in (each.pose, each.info)]
@@ -116,18 +116,12 @@ def _by_image(path: Path) -> dict[int, Record]:
 
 
 def _check(path: Path, place: str, info: Record) -> None:
-    for name in BOXES if isinstance(info, dict) else ():
-        box = info.get(name, [0] * 4)
-        if not isinstance(box, list) or len(box) != 4 or not all(_is_number(v) for v in box):
+    if not isinstance(info, dict):
+        reject(path, place, info, "an object")
+    for name in BOXES:
+        if not are_numbers(box := info.get(name, [0] * 4), 4):
             reject(path, f"{place}.{name}", box, "x, y, width and height")
-    for name in COUNTS if isinstance(info, dict) else ():
+    for name in COUNTS:
         count = info.get(name, 0)
         if not isinstance(count, int | float) or not 0 <= count <= MAX_PIXELS:
             reject(path, f"{place}.{name}", count, "a number of pixels")
-    if not isinstance(info, dict):
-        reject(path, place, info, "an object")
-
-
-def _is_number(value: Any) -> bool:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and abs(value) <= MAX_COORDINATE

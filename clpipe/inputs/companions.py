@@ -20,13 +20,7 @@ from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
 
 # Extensions of companions, in order of preference.
-SUFFIXES = (
-    ".exr",
-    ".pfm",
-    ".tif",
-    ".tiff",
-    ".png",
-)
+SUFFIXES = (".exr", ".pfm", ".tif", ".tiff", ".png")
 
 SEPARATORS = "_.-"  # in a companion's name, between the image's name and the layer's name
 

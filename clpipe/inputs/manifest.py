@@ -34,10 +34,7 @@ from clpipe.inputs.times import decimal_text, time_of
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl", ".txt")
 # No other setting depends on these keys, and their values often differ by row.
-INDEPENDENT_KEYS = (
-    "seed",
-    "noise_key",
-)
+INDEPENDENT_KEYS = ("seed", "noise_key")
 MANIFEST_BYTES = 256 * 2**20  # bytes; enough for two million rows
 
 

@@ -27,6 +27,8 @@ from clpipe.outputs.sidecar import VERSION_KEY, CachedJson, sidecar_bytes
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.stage import ImageLayer
 
+PLACE = "place"  # the entry of a picture that depends on the frames before, with its place
+
 METADATA, PATCHES = "facts", "patches"  # keys of a sidecar of patches
 
 REPEATED_KEYS = ("image_key", "noise_key", "iso", "noise")  # keys that sidecars of patches repeat
@@ -67,9 +69,6 @@ def layer_records(layers: Iterable[ImageLayer]) -> dict[str, list[Mapping[str, A
     for layer in layers:
         records.setdefault(layer.kind, []).append(layer.record)
     return records
-
-
-PLACE = "place"  # the entry of a picture that depends on the frames before, with its place
 
 
 def picture_record(
