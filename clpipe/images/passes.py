@@ -55,11 +55,6 @@ class LayerLocation:
         return self.base.rpartition(".")[0]
 
     @property
-    def is_bare_channel(self) -> bool:
-        """Whether it is a single channel without a layer."""
-        return self.channels == (self.name,)
-
-    @property
     def is_colour(self) -> bool:
         """Whether its channels are red, green and blue."""
         return {channel.upper() for channel in self.channels} >= set("RGB")

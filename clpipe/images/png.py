@@ -1,7 +1,7 @@
 """Reads the colour chunks of a PNG (PNG specification, third edition, 2025)."""
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,7 +44,17 @@ def read_chunks(path: Path) -> dict[bytes, bytes]:
     Raises:
         OSError: the file cannot be read.
     """
-    return dict(_chunks(path))
+    chunks: dict[bytes, bytes] = {}
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        for _ in range(MAX_CHUNKS):
+            head = file.read(8)
+            if len(head) < 8 or head[4:] == b"IDAT":
+                break
+            (size,) = struct.unpack(">I", head[:4])
+            chunks[head[4:]] = file.read(size) if size <= 32 else b""
+            file.seek(size - len(chunks[head[4:]]) + 4, 1)
+    return chunks
 
 
 def png_colours(chunks: Mapping[bytes, bytes]) -> PngColours:
@@ -68,17 +78,3 @@ def png_colours(chunks: Mapping[bytes, bytes]) -> PngColours:
         white, colours = (values := struct.unpack(">8I", chunks[b"cHRM"]))[:2], values[2:]
         chromaticities = tuple(value / 100_000 for value in (*colours, *white))
     return PngColours(chromaticities, curve, "gAMA")
-
-
-def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield name and content of each chunk before the samples; b"" for a long content."""
-    with path.open("rb") as file:
-        file.seek(len(MAGIC))
-        for _ in range(MAX_CHUNKS):
-            head = file.read(8)
-            if len(head) < 8 or head[4:] == b"IDAT":
-                return
-            (size,) = struct.unpack(">I", head[:4])
-            content = file.read(size) if size <= 32 else b""
-            file.seek(size - len(content) + 4, 1)
-            yield head[4:], content

@@ -308,7 +308,9 @@ def vocabulary_warnings(path: Path, format_: str, spec: Any, chunks: Iterable[by
         is_other = space not in (None, EXIF_SRGB) and not has_profile
         return JPEG.warnings(["Exif:ColorSpace"] if is_other else ())
     if format_ == "tiff":
-        return TIFF.warnings(name for name in tiff_tags(path) if name not in OWN_SENTENCES)
+        # A damaged directory has no tags.
+        names = (TiffTags.lookup(tag).name for tag in next(read_directories(path), ()))
+        return TIFF.warnings(name for name in names if name not in OWN_SENTENCES)
     return []
 
 
@@ -316,11 +318,6 @@ def vocabulary_warnings(path: Path, format_: str, spec: Any, chunks: Iterable[by
 def _openexr_warnings(names: tuple[str, ...]) -> tuple[str, ...]:
     stated = (_OPENEXR_NAMES.get(name, name) for name in names if name not in OWN_SENTENCES)
     return tuple(OPENEXR.warnings(name for name in stated if not name.startswith(LIBRARY)))
-
-
-def tiff_tags(path: Path) -> list[str]:
-    """Return the names of the tags of a TIFF's first page; [] if they are damaged."""
-    return [TiffTags.lookup(tag).name for tag in next(read_directories(path), ())]
 
 
 def dng_warnings(path: Path) -> list[str]:

@@ -229,7 +229,8 @@ class LayerFinder:
                 f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs "
                 f"{min_channels} or more; choose another kind with --carry {spec.name}:KIND"
             )
-        is_named = location.name and not (location.is_bare_channel and file != self.path)
+        is_bare_channel = location.channels == (location.name,)
+        is_named = location.name and not (is_bare_channel and file != self.path)
         layer = location.name if is_named else spec.name
         # A channel of a view, such as right.Z, is named like its layer.
         is_last = location.channels == (location.name.rpartition(".")[2],)
