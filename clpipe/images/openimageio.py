@@ -222,16 +222,3 @@ def read_with_pillow(path: Path, spec: Any, part: int, type_: Any) -> Array | No
     except (OSError, ValueError, SyntaxError):
         return None
     return samples / np.float32(255) if type_ == oiio.FLOAT else samples
-
-
-def read_grey(path: Path) -> Array:
-    """Return the first channel of a picture as stored: (height, width), integers or floats.
-
-    Raises:
-        ImageError: the file cannot be read.
-    """
-    with open_image(path) as file:
-        pixels = file.read_image(0, 0, 0, 1)
-        if pixels is None:
-            raise ImageError(f"{path}: {damage_text(file.geterror())}")
-        return np.asarray(pixels)[..., 0]

@@ -5,7 +5,7 @@ mask and mask_visib contain a PNG for each object of each image:
 https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from clpipe.inputs.annotation_keys import BOP, name_unknown
 from clpipe.inputs.annotations import (
     MAX_PIXELS,
     AnnotatedRender,
+    Annotations,
     Record,
     are_numbers,
     read_json,
@@ -45,17 +46,13 @@ class BopObject:
 
 
 @dataclass(frozen=True)
-class Bop:
-    """A scene, see :class:`~clpipe.inputs.annotations.Annotations`.
+class Bop(Annotations):
+    """A scene: a list of :class:`BopObject` for each image. The name of an image is its number.
 
     Args:
-        file: scene_gt.json.
-        renders: a list of :class:`BopObject` for each image. The name of an image is its number.
         cameras: the records of scene_camera.json, by the numbers of the images.
     """
 
-    file: Path
-    renders: Sequence[AnnotatedRender]
     cameras: Mapping[int, Record]
 
 

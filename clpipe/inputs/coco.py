@@ -14,6 +14,7 @@ from clpipe.inputs.annotations import (
     MAX_COORDINATE,
     MAX_PIXELS,
     AnnotatedRender,
+    Annotations,
     Record,
     are_numbers,
     reject,
@@ -23,26 +24,16 @@ REQUIRED_LISTS = ("images", "annotations", "categories")
 
 
 @dataclass(frozen=True)
-class Coco:
-    """Annotations of renders, see :class:`~clpipe.inputs.annotations.Annotations`.
+class Coco(Annotations):
+    """Annotations of renders, each with its record in the file.
 
     Args:
-        file: the JSON file.
         values: all of its values.
         of_image: the annotations of each image, by the image's id.
     """
 
-    file: Path
     values: Mapping[str, Any]
     of_image: Mapping[Any, Sequence[Record]]
-
-    @property
-    def renders(self) -> list[AnnotatedRender]:
-        """The annotated renders, each with its record in the file."""
-        return [
-            AnnotatedRender(image["file_name"], (image["width"], image["height"]), image)
-            for image in self.values["images"]
-        ]
 
 
 def read_coco(path: Path, values: Any) -> Coco:
@@ -63,6 +54,7 @@ def read_coco(path: Path, values: Any) -> Coco:
     of_image: dict[Any, list[Record]] = {}
     sizes: dict[Any, tuple[int, int]] = {}
     names: set[str] = set()
+    renders: list[AnnotatedRender] = []
     for number, image in enumerate(images):
         size = [image.get(name) for name in ("width", "height")]
         if not all(isinstance(side, int) and 0 < side <= MAX_COORDINATE for side in size):
@@ -77,6 +69,7 @@ def read_coco(path: Path, values: Any) -> Coco:
             reject(path, f"images[{number}]", found, "one entry for each file")
         names.add(image["file_name"])
         sizes[image["id"]] = image["width"], image["height"]
+        renders.append(AnnotatedRender(image["file_name"], sizes[image["id"]], image))
         of_image[image["id"]] = []
     for number, each in enumerate(annotations):
         place = f"annotations[{number}]"
@@ -87,7 +80,7 @@ def read_coco(path: Path, values: Any) -> Coco:
         _check(path, place, each, sizes[each["image_id"]])
         of_image[each["image_id"]].append(each)
     name_unknown(path, COCO, [values, *images, *annotations])
-    return Coco(path, values, of_image)
+    return Coco(path, renders, values, of_image)
 
 
 def _check_id(path: Path, place: str, found: Any) -> None:
