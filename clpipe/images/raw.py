@@ -21,7 +21,7 @@ from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import ARRAY_SEPARATOR, D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS, check_size
-from clpipe.images.tags import DATE, FLIPS
+from clpipe.images.tags import DATE_PATTERN, FLIPS
 from clpipe.images.tiff import read_directories
 from clpipe.images.two_lights import TEMPERATURES, Light, camera_to_srgb
 from clpipe.images.vocabularies import dng_warnings, raw_compression
@@ -134,7 +134,7 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
             orientation=ORIENTATIONS.get(size.flip, 1),
             aperture=exif.number(F_NUMBER, aperture),
             focal_length=exif.number(FOCAL_LENGTH, focal_length),
-            taken=next(filter(DATE.fullmatch, map(exif.text, DATES)), ""),
+            taken=next(filter(DATE_PATTERN.fullmatch, map(exif.text, DATES)), ""),
             unused=tuple(dng_warnings(path)),
         )
 

@@ -96,9 +96,7 @@ def read_part(
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 
-def read_whole_numbers(
-    path: Path, max_pixels: int = DEFAULT_MAX_PIXELS, colours: bool = False
-) -> Array:
+def read_whole_numbers(path: Path, colours: bool = False) -> Array:
     """Return the samples of a picture as they are stored, uint8 or uint16.
 
     They are its first channel, (height, width), or with ``colours`` its first three channels,
@@ -114,7 +112,7 @@ def read_whole_numbers(
                 f"{path}: this file has samples of type {spec.format}, but integers of 8 or 16 "
                 "bits are expected. Convert it to an 8- or 16-bit PNG or TIFF"
             )
-        check_size(path, spec.width, spec.height, max_pixels)
+        check_size(path, spec.width, spec.height, DEFAULT_MAX_PIXELS)
         samples = read_samples(path, file, 0, range(3 if colours else 1), spec.format.basetype)
         return samples if colours else samples[..., 0]
 

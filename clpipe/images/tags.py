@@ -17,7 +17,7 @@ from clpipe.camera.optics import FILM_DIAGONAL
 from clpipe.images.encoding import Encoding
 
 TAG_ATTRIBUTES = ("exif", "orientation")  # attributes that contain an image's tags
-DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # EXIF's format
+DATE_PATTERN = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # EXIF's format
 NOT_CARRIED = ("sensor_width", "encoding")  # fields of tags that attributes do not contain
 DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged; write the file again"
 
