@@ -124,8 +124,10 @@ def test_a_manifest_is_not_for_the_package(tmp_path, decoded):
     path = tmp_path / "a.exr"
     path.write_bytes(exr(planes, 4, 4))
     assert decoded(path)[0]
-    path.write_bytes(exr(planes, 4, 4, attributes=[("ids", "idmanifest", bytes(100))]))
-    assert not decoded(path)[0]
+    manifest, long = ("ids", "idmanifest", bytes(100)), ("a", "string", bytes(70_000))
+    for attributes in ([manifest], [long, manifest], [long]):
+        path.write_bytes(exr(planes, 4, 4, attributes=attributes))
+        assert not decoded(path)[0]
 
 
 def damage(data, kind):

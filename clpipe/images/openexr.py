@@ -5,6 +5,7 @@ part on standard output, and raises no exception.
 """
 
 import contextlib
+import struct
 import sys
 import threading
 from collections import deque
@@ -20,9 +21,7 @@ from clpipe.base.types import Array
 
 # The types that are read, by OpenImageIO's names.
 DTYPES: dict[str, np.dtype[Any]] = {"half": np.dtype(np.float16), "float": np.dtype(np.float32)}
-# OpenEXR decompresses an attribute of this type, to up to a thousand times its size.
-MANIFEST = b"\0idmanifest\0"
-HEADER_BYTES = 1 << 16  # in which the attribute is searched
+HEADER_BYTES = 1 << 16  # bytes; longer headers are unusual
 MAX_EXTRA = 2  # the memory of all channels, relative to the memory of the requested channels
 
 
@@ -67,7 +66,7 @@ def read_channels(path: Path, file: Any, indices: Sequence[int]) -> Array | None
     stored = sum(each.size() for each in formats)
     if dtype is None or stored > MAX_EXTRA * len(indices) * dtype.itemsize:
         return None
-    if _has_several_parts(file) or MANIFEST in read_start(path, HEADER_BYTES):
+    if _has_several_parts(file) or _has_manifest(read_start(path, HEADER_BYTES)):
         return None
     names = [spec.channelnames[i] for i in indices]
     layer = names[0].removesuffix("R")
@@ -90,6 +89,23 @@ def _has_several_parts(file: Any) -> bool:
     file.seek_subimage(0, 0)
     file.geterror()  # clears the error: the second part need not exist
     return bool(found)
+
+
+def _has_manifest(start: bytes) -> bool:
+    """Return whether a header has an idmanifest, or does not end in the first bytes of its file.
+
+    OpenEXR decompresses such an attribute, to up to a thousand times its size.
+    """
+    offset = 8
+    with contextlib.suppress(IndexError, ValueError, struct.error):
+        while start[offset]:
+            type_ = start.index(0, offset) + 1
+            size = start.index(0, type_) + 1
+            if start.startswith(b"idmanifest", type_):
+                return True
+            offset = size + 4 + struct.unpack_from("<I", start, size)[0]
+        return False
+    return True
 
 
 def _join_planes(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
