@@ -162,6 +162,7 @@ def damage(data, kind):
     return data
 
 
+DECODED = ("leader", "zeros")  # OpenEXR prints why its decoder fails
 REPAIRED = ("missing", "outside")  # the table is made anew from the chunks
 
 
@@ -169,14 +170,16 @@ REPAIRED = ("missing", "outside")  # the table is made anew from the chunks
     "kind", ["cut", "half", "table", "order", "leader", "zeros", "unfinished", *REPAIRED]
 )
 @pytest.mark.parametrize("tile", [None, (16, 16)])
-def test_damaged_files_are_what_they_are_to_openimageio(tmp_path, decoded, capsys, kind, tile):
+def test_damaged_files_are_what_they_are_to_openimageio(tmp_path, decoded, capfd, kind, tile):
     for name in ("RGB", "RGBA"):
         path = save(tmp_path / "a.exr", {name: light(len(name))}, tile=tile)
         path.write_bytes(damage(path.read_bytes(), kind))
         used, found = decoded(path)
-        assert not used or kind in REPAIRED
+        assert not used
         assert found[1] == (HEIGHT, WIDTH, 3) if kind in REPAIRED else found.startswith(f"{path}: ")
-    assert capsys.readouterr().out == ""
+    printed = capfd.readouterr()
+    assert printed.out == ""
+    assert kind in DECODED or printed.err == ""
 
 
 def test_standard_output_is_that_of_the_other_threads(tmp_path, capsys):

@@ -5,6 +5,7 @@ part on standard output, and raises no exception.
 """
 
 import contextlib
+import os
 import struct
 import sys
 import threading
@@ -16,12 +17,13 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.cpu_time import CpuTimer
-from clpipe.base.reading import read_start
 from clpipe.base.types import Array
 
 # The types that are read, by OpenImageIO's names.
 DTYPES: dict[str, np.dtype[Any]] = {"half": np.dtype(np.float16), "float": np.dtype(np.float32)}
 HEADER_BYTES = 1 << 16  # bytes; longer headers are unusual
+# Rows of a chunk, by OpenImageIO's name of the compression; others have 1.
+CHUNK_ROWS = {"zip": 16, "pxr24": 16, "piz": 32, "b44": 32, "b44a": 32, "dwaa": 32, "dwab": 256}
 MAX_EXTRA = 2  # the memory of all channels, relative to the memory of the requested channels
 
 
@@ -66,7 +68,7 @@ def read_channels(path: Path, file: Any, indices: Sequence[int]) -> Array | None
     stored = sum(each.size() for each in formats)
     if dtype is None or stored > MAX_EXTRA * len(indices) * dtype.itemsize:
         return None
-    if _has_several_parts(file) or _has_manifest(read_start(path, HEADER_BYTES)):
+    if _has_several_parts(file) or not _is_usual(path, spec):
         return None
     names = [spec.channelnames[i] for i in indices]
     layer = names[0].removesuffix("R")
@@ -91,21 +93,34 @@ def _has_several_parts(file: Any) -> bool:
     return bool(found)
 
 
-def _has_manifest(start: bytes) -> bool:
-    """Return whether a header has an idmanifest, or does not end in the first bytes of its file.
+def _is_usual(path: Path, spec: Any) -> bool:
+    """Return whether the package reads a file well: its chunks are complete and in order.
 
-    OpenEXR decompresses such an attribute, to up to a thousand times its size.
+    The package prints errors of other files. It also decompresses an idmanifest in the header, to
+    up to a thousand times its size.
     """
-    offset = 8
-    with contextlib.suppress(IndexError, ValueError, struct.error):
-        while start[offset]:
-            type_ = start.index(0, offset) + 1
+    with path.open("rb") as file, contextlib.suppress(IndexError, ValueError, struct.error):
+        start, end = file.read(HEADER_BYTES), 8
+        while start[end]:
+            type_ = start.index(0, end) + 1
             size = start.index(0, type_) + 1
             if start.startswith(b"idmanifest", type_):
-                return True
-            offset = size + 4 + struct.unpack_from("<I", start, size)[0]
-        return False
-    return True
+                return False
+            end = size + 4 + struct.unpack_from("<I", start, size)[0]
+        rows = CHUNK_ROWS.get(str(spec.getattribute("compression")).partition(":")[0], 1)
+        columns, leader = spec.width, 8
+        if spec.tile_width:
+            columns, rows, leader = spec.tile_width, spec.tile_height, 20
+        chunks = -(-spec.height // rows) * -(-spec.width // columns)
+        file.seek(end + 1)
+        offsets = np.frombuffer(file.read(8 * chunks), "<u8")
+        first, last = sorted((int(offsets[0]), int(offsets[-1])))
+        ascending, data = offsets[1:] > offsets[:-1], file.tell()
+        file.seek(last + leader - 4)
+        (packed,) = struct.unpack("<I", file.read(4))
+        in_order = len(offsets) == chunks and (ascending.all() or not ascending.any())
+        return in_order and first >= data and last + leader + packed <= file.seek(0, os.SEEK_END)
+    return False
 
 
 def _join_planes(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
