@@ -4,13 +4,13 @@ Only this module imports it. The package decodes every channel of every part. It
 part on standard output, and raises no exception.
 """
 
-import contextlib
 import os
 import struct
 import sys
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def _is_usual(path: Path, spec: Any) -> bool:
     The package prints errors of other files. It also decompresses an idmanifest in the header, to
     up to a thousand times its size.
     """
-    with path.open("rb") as file, contextlib.suppress(IndexError, ValueError, struct.error):
+    with suppress(OSError, IndexError, ValueError, struct.error), path.open("rb") as file:
         start, end = file.read(HEADER_BYTES), 8
         while start[end]:
             type_ = start.index(0, end) + 1
@@ -182,7 +182,7 @@ _silent: list[threading.Thread] = []
 _kept: deque[_FilteredStdout] = deque(maxlen=16)
 
 
-@contextlib.contextmanager
+@contextmanager
 def _discard_stdout() -> Iterator[None]:
     """Discard what this thread writes to standard output. Other threads are not affected."""
     with _lock:
