@@ -9,17 +9,13 @@ from clpipe.images import tiff
 
 # A camera's colours at D65, as DNG's ColorMatrix2 has them.
 MATRIX = ((0.4716, 0.0603, -0.0830), (-0.7798, 1.5474, 0.2480), (-0.1496, 0.1937, 0.6651))
-MAKERS = {
-    **{1: tiff.byte, 3: tiff.short, 4: tiff.long, 5: tiff.rational, 10: tiff.signed_rational},
-    12: tiff.double,
-}  # by TIFF's field types
 
 
 def field(tag: int, type_: int, *values) -> tuple[int, tiff.Field]:
     """A TIFF field; text is given as bytes."""
     if type_ == 2:
         return tag, tiff.Field(2, len(values[0]) + 1, values[0] + b"\0")
-    return tag, MAKERS[type_](*values)
+    return tag, tiff.MAKERS[type_](*values)
 
 
 def write_dng(

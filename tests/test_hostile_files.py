@@ -1,6 +1,5 @@
 """Malformed files are rejected quickly and within little memory."""
 
-import io
 import os
 import re
 import socket
@@ -8,6 +7,7 @@ import struct
 import subprocess
 import sys
 import tarfile
+import time
 import zlib
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from clpipe.chain.isos import check_cameras
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
 from clpipe.images.dump import parse_dump, read_dump
-from clpipe.images.raw import EXIF_BYTES, MAX_READS, read_exif, read_raw_info
+from clpipe.images.raw import read_exif, read_raw_info
 from clpipe.images.read import ReadOptions, read_source
 from clpipe.images.samples import holds_mosaic
 from clpipe.inputs.manifest import read_manifest
@@ -205,27 +205,13 @@ def test_a_dump_of_another_size_is_not_read(tmp_path, clpipe):
     assert "a.raw: this file has 1099511627776 bytes, but 96x80 uint8 has 7680" in done.output
 
 
-@pytest.mark.slow
-def test_exif_that_repeats_itself_is_given_up(tmp_path, monkeypatch):
-    """65,535 tags of 999 values each, all of the same bytes: minutes, read one by one."""
-    tags = struct.pack("<HHII", 33434, 1, 999, 8) * 65_535
+def test_exif_that_repeats_itself_is_given_up(tmp_path):
+    """65,535 tags of 65,535 values each, all of the same bytes: minutes, if all were read."""
+    tags = struct.pack("<HHII", 33434, 1, 65_535, 8) * 65_535
     (tmp_path / "a.dng").write_bytes(b"II*\0" + struct.pack("<IH", 8, 65_535) + tags + bytes(4))
-    sizes = []
-
-    class Counted(io.FileIO):
-        def read(self, size=-1):
-            data = super().read(size)
-            sizes.append(len(data))
-            return data
-
-    def opened(path, mode):
-        return Counted(path, mode)
-
-    monkeypatch.setattr(Path, "open", opened)
-    assert read_exif(tmp_path / "a.dng").tags == {}
-    # Without a limit there are more than 65 million reads.
-    assert 0 < len(sizes) <= MAX_READS + 1
-    assert max(sizes) <= EXIF_BYTES
+    started = time.process_time()
+    assert not read_exif(tmp_path / "a.dng").directories
+    assert time.process_time() - started < 5
 
 
 # How each file that a request names is read, by the ending of its name.

@@ -15,7 +15,8 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.request import Request
 from clpipe.chain.settings import settings_from
 from clpipe.chain.toml import toml_value
-from clpipe.inputs.manifest import Row, check_output_name, check_rows, read_manifest
+from clpipe.inputs.find import Job
+from clpipe.inputs.manifest import check_output_name, check_rows, read_manifest
 from tests.conftest import noise_report
 
 DEFAULT = settings_from({})
@@ -45,12 +46,12 @@ def test_a_csv(manifest, tmp_path, bom, end):
     ]
     rows = manifest(bom + end.join(lines))
     assert rows == [
-        Row(tmp_path / "a.exr", "a.exr", "", {}, None, f"{tmp_path}/frames.csv, row 2"),
-        Row(
+        Job(tmp_path / "a.exr", "a.exr", location=f"{tmp_path}/frames.csv, row 2"),
+        Job(
             tmp_path / "b/c.0001.exr",
             "view1/c.0001",
             "view1/c.0001",
-            {
+            values={
                 "iso": 800,
                 "camera": "canon-5d2",
                 "seed": 7,
@@ -58,16 +59,17 @@ def test_a_csv(manifest, tmp_path, bom, end):
                 "demosaic": {"method": "bilinear"},
                 "render": {"focal_length": 35},
             },
-            3,
-            f"{tmp_path}/frames.csv, row 4",
+            frames=3,
+            location=f"{tmp_path}/frames.csv, row 4",
         ),
-        Row(
+        Job(
             tmp_path / "d, e.exr",
             "d, e.exr",
-            "",
-            {"iso": {"choice": [100, 400]}, "sensor_noise": {"a": {"uniform": [1e-4, 2e-4]}}},
-            None,
-            f"{tmp_path}/frames.csv, row 5",
+            values={
+                "iso": {"choice": [100, 400]},
+                "sensor_noise": {"a": {"uniform": [1e-4, 2e-4]}},
+            },
+            location=f"{tmp_path}/frames.csv, row 5",
         ),
     ]
     assert [row.stem for row in rows] == ["a", "view1/c.0001", "d, e"]

@@ -162,4 +162,4 @@ def test_a_kernel_does_not_depend_on_names_slots_places_or_the_border():
 def test_numbers_that_numpy_computed_are_written_as_numbers(clpipe):
     """NumPy writes its own floats with their type, which TOML does not read."""
     text = clpipe("plan", "--toml", "--iso", "3200").stdout
-    assert "# noise = 0.00" in text and "np." not in text
+    assert "\n# luma_noise = 0.0" in text and "np." not in text

@@ -7,7 +7,6 @@ import time
 import pytest
 
 from clpipe.engine.sources import kernel_folder
-from clpipe.engine.store import Store
 from clpipe.outputs import program
 from clpipe.outputs.program import program_digest
 from tests.conftest import ROOT
@@ -20,7 +19,6 @@ def copy(tmp_path, monkeypatch):
     shutil.copytree(kernel_folder(), tmp_path / "kernels")
     folders = [tmp_path / "clpipe", tmp_path / "kernels"]
     monkeypatch.setattr(program, "_folders", lambda: folders)
-    monkeypatch.setattr(program, "cache_folder", lambda: tmp_path / "cache")
     return program_digest.__wrapped__
 
 
@@ -59,14 +57,3 @@ def test_libraries_that_decode_and_encode_count(copy, monkeypatch):
     before = copy()
     monkeypatch.setattr(program, "versions", lambda: {"OpenEXR": "0.1"})
     assert copy() != before
-
-
-def test_it_is_remembered_for_each_state_of_the_files(copy, tmp_path, monkeypatch):
-    before = copy()
-    (kept,) = (tmp_path / "cache/known").iterdir()
-    with monkeypatch.context() as patch:
-        patch.setattr(Store, "load", lambda *_: b"0" * 64)
-        assert copy() != before
-    kept.write_bytes(b"damaged")
-    assert copy() == before
-    assert kept.read_bytes().endswith(program._content(program._folders()).encode())

@@ -2,5 +2,5 @@
 
 The package converts files to arrays and plain values, and back. Higher packages decide at which
 stage an image enters the chain, and which images are written. The package imports ``stage`` and
-below. Only this package imports OpenImageIO, OpenEXR, Pillow, PyAV, rawpy and exifread.
+below. Only this package imports OpenImageIO, OpenEXR, Pillow, PyAV and rawpy.
 """

@@ -7,7 +7,7 @@ from typing import Any
 
 from clpipe.base.errors import ImageError
 from clpipe.images.openimageio import open_image
-from clpipe.images.tags import DATE, FLIPS, sensor_width, shot_to_attributes
+from clpipe.images.tags import DATE_PATTERN, FLIPS, sensor_width, shot_to_attributes
 
 SHOT_OF_TAGS = {"exposure_time": "exposure", "focal_length": "focal_length"}
 PREFIX = "clpipe:"  # prefix of clpipe's attribute names
@@ -68,7 +68,7 @@ def photograph_attributes(spec: Any) -> tuple[dict[str, str], dict[str, float]]:
         shot["sensor_width"] = sensor_width(length, equivalent, spec.height, spec.width)
     taken = str(spec.getattribute("Exif:DateTimeOriginal") or "")
     tags: dict[str, float | str] = {**values}
-    if DATE.fullmatch(taken):
+    if DATE_PATTERN.fullmatch(taken):
         tags["taken"] = taken
     orientation = spec.getattribute("Orientation")
     orientation_ = orientation if orientation in FLIPS else 1

@@ -77,22 +77,16 @@ def claim_of(path: Path, mosaic: bool = False) -> MemoryClaim | None:
         mosaic: whether only a single channel is read.
     """
     try:
+        if clip := clip_of(path):
+            width, height = clip_size(clip)
+            pixels = width * height * 3 * FLOAT
+            return MemoryClaim(width, height, pixels, 2 * pixels)
         if path.suffix.lower() in RAW_SUFFIXES:
             return mosaic_claim(*raw_size(path))
         with open_image(path) as file:
             return _claim(file.spec(), file.format_name() == "openexr", mosaic)
     except ImageError:
-        return _claim_of_frame(path)
-
-
-def _claim_of_frame(path: Path) -> MemoryClaim | None:
-    """Return the claim of a frame of a clip; None if the path names none."""
-    clip = clip_of(path)
-    if not clip:
         return None
-    width, height = clip_size(clip)
-    pixels = width * height * 3 * FLOAT
-    return MemoryClaim(width, height, pixels, 2 * pixels)
 
 
 def _claim(spec: Any, is_exr: bool, mosaic: bool) -> MemoryClaim:

@@ -66,19 +66,8 @@ def with_thumbnail(file: bytes, pixels: Array) -> bytes:
 
 def _exif_range(file: bytes) -> tuple[int, int]:
     """Return the offsets at which the EXIF of a file begins and ends."""
-    if file.startswith(PNG):
-        offset = len(PNG)
-        while True:
-            size, kind = (
-                int.from_bytes(file[offset : offset + 4], "big"),
-                file[offset + 4 : offset + 8],
-            )
-            if kind == b"eXIf":
-                return offset + 8, offset + 8 + size
-            offset += 12 + size
-    offset = 2
-    while True:
-        size = int.from_bytes(file[offset + 2 : offset + 4], "big")
-        if file[offset + 1] == 0xE1 and file[offset + 4 : offset + 10] == HEADER:
-            return offset + 4, offset + 2 + size
-        offset += 2 + size
+    with Image.open(BytesIO(file)) as image:
+        exif = image.info["exif"]
+    found = exif.removeprefix(HEADER) if file.startswith(PNG) else exif
+    start = file.index(found)
+    return start, start + len(found)

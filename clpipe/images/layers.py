@@ -10,6 +10,7 @@ from clpipe.base.errors import ImageError, KindError, NoPictureError
 from clpipe.base.text import printable
 from clpipe.images.attributes import clpipe_attributes
 from clpipe.images.kinds import is_aov
+from clpipe.images.openimageio import MAX_PARTS, parts_of
 
 # Names of layers that hold the finished picture, in order of preference, in lower-case letters. The
 # first are channels R, G and B without a layer: Nuke, Arnold, V-Ray, Mitsuba, Octane, Unreal.
@@ -35,8 +36,6 @@ GENERIC_NAMES = (
     "main",
     "image",
 )  # in layers of any kind
-
-MAX_PARTS = 1000  # the time to reach a part grows with the number of parts before it
 
 
 @dataclass(frozen=True)
@@ -93,34 +92,29 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     channel_names: list[str] = []
     rejections: list[str] = []
     views: list[str] = []
-    several_parts = file.seek_subimage(1, 0)
-    part = 0
-    while file.seek_subimage(part, 0):
-        spec = file.spec()
-        part += 1
-        if part > MAX_PARTS:
+    for part, part_name, spec in parts_of(file):
+        if part >= MAX_PARTS:
             raise ImageError(
                 f"{path}: this file has more than {MAX_PARTS} parts; split it into several files"
             )
-        if rejection := _rejection(spec, has_levels=file.seek_subimage(part - 1, 1)):
+        if rejection := _rejection(spec, has_levels=file.seek_subimage(part, 1)):
             rejections.append(rejection)
             continue
         names = list(spec.channelnames)
         channel_names += [name for name in names if name not in channel_names]
         is_kept = "kind" in clpipe_attributes(spec)
-        part_name = str(spec.getattribute("oiio:subimagename") or "") if several_parts else ""
         views += stated_views(spec)
         channel = mosaic_channel(names) if mosaic else None
         found = [] if mosaic else list(_layers(names, is_kept))
         if is_kept and not (found or channel):
             raise KindError(path, clpipe_attributes(spec))
-        pictures += [PictureLocation(part - 1, *channel)] if channel else []
+        pictures += [PictureLocation(part, *channel)] if channel else []
         for layer_name, channels, xyz in found:
             full = full_name(part_name, layer_name)
             rejections += (problem := _integer_problem(spec, full, channels))
             if not problem:
                 view, name = view_of(full, views)
-                pictures.append(PictureLocation(part - 1, full, channels, xyz, view, name))
+                pictures.append(PictureLocation(part, full, channels, xyz, view, name))
     if not pictures and rejections:
         raise ImageError(f"{path}: {rejections[0]}")
     if not pictures:
@@ -130,7 +124,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         raise NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", advice)
     best = _preferred(path, pictures) if layer is None else _picture_in_layer(path, pictures, layer)
     file.seek_subimage(best.part, 0)
-    file.geterror()  # clears the error: the loop asked for parts and levels that do not exist
+    file.geterror()  # clears the error: the loop asked for levels that do not exist
     return best
 
 

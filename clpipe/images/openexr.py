@@ -4,11 +4,13 @@ Only this module imports it. The package decodes every channel of every part. It
 part on standard output, and raises no exception.
 """
 
-import contextlib
+import os
+import struct
 import sys
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +18,12 @@ import numpy as np
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
-from clpipe.images.exr_header import read_header
 
+# The types that are read, by OpenImageIO's names.
+DTYPES: dict[str, np.dtype[Any]] = {"half": np.dtype(np.float16), "float": np.dtype(np.float32)}
+HEADER_BYTES = 1 << 16  # bytes; longer headers are unusual
+# Rows of a chunk, by OpenImageIO's name of the compression; others have 1.
+CHUNK_ROWS = {"zip": 16, "pxr24": 16, "piz": 32, "b44": 32, "b44a": 32, "dwaa": 32, "dwab": 256}
 MAX_EXTRA = 2  # the memory of all channels, relative to the memory of the requested channels
 
 
@@ -40,33 +46,33 @@ def open_exr(path: Path, header_only: bool = False, separate: bool = True) -> An
         )
 
 
-def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> Array | None:
+def read_channels(path: Path, file: Any, indices: Sequence[int]) -> Array | None:
     """Return channels of an OpenEXR file as stored: (rows, columns, channel), float16 or float32.
 
     R, G and B without alpha are interleaved in memory. For other channels, the array is a view of
     consecutive planes.
 
     Args:
-        path: the file, whose header OpenImageIO has accepted.
-        names: the names of the channels in the file.
-        shape: rows and columns of its data window.
+        path: the file.
+        file: the open ``oiio.ImageInput``, at its first part.
+        indices: the numbers of the channels.
 
     Returns:
-        The samples; None if OpenImageIO must read the file, because it is unusual or damaged, or
-        other channels would take too much time and memory.
+        The samples; None if OpenImageIO must read the file, because it has several parts or is
+        damaged, or because other channels would take too much time and memory.
     """
-    header = read_header(path, shape)
-    if header is None or not header.channels.keys() >= set(names):
+    spec = file.spec()
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    types = {str(formats[i]) for i in indices}
+    dtype = DTYPES.get(types.pop()) if len(types) == 1 else None
+    stored = sum(each.size() for each in formats)
+    if dtype is None or stored > MAX_EXTRA * len(indices) * dtype.itemsize:
         return None
-    types = header.channels
-    dtype = types[names[0]]
-    size = sum(each.itemsize for each in types.values())
-    if {types[name] for name in names} != {dtype} or dtype.kind != "f":
+    if _has_several_parts(file) or not _is_usual(path, spec):
         return None
-    if size > MAX_EXTRA * len(names) * dtype.itemsize:
-        return None
+    names = [spec.channelnames[i] for i in indices]
     layer = names[0].removesuffix("R")
-    is_rgb = list(names) == [layer + colour for colour in "RGB"] and layer + "A" not in types
+    is_rgb = names == [layer + colour for colour in "RGB"] and layer + "A" not in spec.channelnames
     try:
         channels = open_exr(path, separate=not is_rgb).parts[0].channels
         if is_rgb:
@@ -75,7 +81,46 @@ def read_channels(path: Path, names: Sequence[str], shape: tuple[int, int]) -> A
             pixels = _join_planes(channels, names, dtype)
     except Exception:  # OpenImageIO reports the error
         return None
-    return pixels if (pixels.shape, pixels.dtype) == ((*shape, len(names)), dtype) else None
+    shape = spec.height, spec.width, len(names)
+    return pixels if (pixels.shape, pixels.dtype) == (shape, dtype) else None
+
+
+def _has_several_parts(file: Any) -> bool:
+    """Return whether an open file has several parts; it is at its first one."""
+    found = file.seek_subimage(1, 0)
+    file.seek_subimage(0, 0)
+    file.geterror()  # clears the error: the second part need not exist
+    return bool(found)
+
+
+def _is_usual(path: Path, spec: Any) -> bool:
+    """Return whether the package reads a file well: its chunks are complete and in order.
+
+    The package prints errors of other files. It also decompresses an idmanifest in the header, to
+    up to a thousand times its size.
+    """
+    with suppress(OSError, IndexError, ValueError, struct.error), path.open("rb") as file:
+        start, end = file.read(HEADER_BYTES), 8
+        while start[end]:
+            type_ = start.index(0, end) + 1
+            size = start.index(0, type_) + 1
+            if start.startswith(b"idmanifest", type_):
+                return False
+            end = size + 4 + struct.unpack_from("<I", start, size)[0]
+        rows = CHUNK_ROWS.get(str(spec.getattribute("compression")).partition(":")[0], 1)
+        columns, leader = spec.width, 8
+        if spec.tile_width:
+            columns, rows, leader = spec.tile_width, spec.tile_height, 20
+        chunks = -(-spec.height // rows) * -(-spec.width // columns)
+        file.seek(end + 1)
+        offsets = np.frombuffer(file.read(8 * chunks), "<u8")
+        first, last = sorted((int(offsets[0]), int(offsets[-1])))
+        ascending, data = offsets[1:] > offsets[:-1], file.tell()
+        file.seek(last + leader - 4)
+        (packed,) = struct.unpack("<I", file.read(4))
+        in_order = len(offsets) == chunks and (ascending.all() or not ascending.any())
+        return in_order and first >= data and last + leader + packed <= file.seek(0, os.SEEK_END)
+    return False
 
 
 def _join_planes(channels: dict[str, Any], names: Sequence[str], dtype: np.dtype[Any]) -> Array:
@@ -137,7 +182,7 @@ _silent: list[threading.Thread] = []
 _kept: deque[_FilteredStdout] = deque(maxlen=16)
 
 
-@contextlib.contextmanager
+@contextmanager
 def _discard_stdout() -> Iterator[None]:
     """Discard what this thread writes to standard output. Other threads are not affected."""
     with _lock:

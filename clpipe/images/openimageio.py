@@ -19,6 +19,7 @@ from clpipe.base.text import printable
 from clpipe.base.types import Array
 from clpipe.images import pfm, radiance
 
+MAX_PARTS = 1000  # parts of a file that are searched
 ERROR_LENGTH = 400  # characters; some repeat what they found, of any length
 
 # The first bytes of each format. OpenImageIO would try the readers of twenty more formats, which
@@ -145,6 +146,21 @@ def _readable_copy(path: Path, signature: bytes, size: int) -> Iterator[Path]:
         yield Path(copy.name)
 
 
+def parts_of(file: Any) -> Iterator[tuple[int, str, Any]]:
+    """Yield the number of each part of an open file, its name and its ``oiio.ImageSpec``.
+
+    The file is at that part. The only part of a file has no name. The first :data:`MAX_PARTS` and
+    one more are yielded, because the time to reach a part grows with the number of parts before it.
+    """
+    several = file.seek_subimage(1, 0)
+    for part in range(MAX_PARTS + 1):
+        if not file.seek_subimage(part, 0):
+            break
+        spec = file.spec()
+        yield part, str(spec.getattribute("oiio:subimagename") or "") if several else "", spec
+    file.geterror()  # clears the error: the loop asked for a part that does not exist
+
+
 def radiance_header(path: Path) -> radiance.RadianceHeader:
     """Return the header of a Radiance picture.
 
@@ -206,16 +222,3 @@ def read_with_pillow(path: Path, spec: Any, part: int, type_: Any) -> Array | No
     except (OSError, ValueError, SyntaxError):
         return None
     return samples / np.float32(255) if type_ == oiio.FLOAT else samples
-
-
-def read_grey(path: Path) -> Array:
-    """Return the first channel of a picture as stored: (height, width), integers or floats.
-
-    Raises:
-        ImageError: the file cannot be read.
-    """
-    with open_image(path) as file:
-        pixels = file.read_image(0, 0, 0, 1)
-        if pixels is None:
-            raise ImageError(f"{path}: {damage_text(file.geterror())}")
-        return np.asarray(pixels)[..., 0]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.types import Array
 from clpipe.images.clip_frames import clip_of, read_clip_samples
 from clpipe.images.kinds import kind_from_name
-from clpipe.images.layers import MAX_PARTS, full_name, stated_views, view_of
-from clpipe.images.openimageio import open_image
+from clpipe.images.layers import full_name, stated_views, view_of
+from clpipe.images.openimageio import MAX_PARTS, open_image, parts_of
 from clpipe.images.pixels import check_size
 from clpipe.images.samples import read_samples
 from clpipe.images.statements import read_statements
@@ -52,11 +53,6 @@ class LayerLocation:
     def view_layer(self) -> str:
         """The name of the view layer that it belongs to: its name before the last part, or ""."""
         return self.base.rpartition(".")[0]
-
-    @property
-    def is_bare_channel(self) -> bool:
-        """Whether it is a single channel without a layer."""
-        return self.channels == (self.name,)
 
     @property
     def is_colour(self) -> bool:
@@ -101,16 +97,10 @@ def find_layers(path: Path) -> list[LayerLocation]:
         channels = tuple("RGB") if samples.ndim == 3 else ("Y",)
         return [LayerLocation("", 0, channels, tuple(range(len(channels))), oiio.UINT16)]
     with open_image(path) as file:
-        several = file.seek_subimage(1, 0)
-        part = 0
-        while part < MAX_PARTS and file.seek_subimage(part, 0):
-            spec = file.spec()
+        for part, part_name, spec in islice(parts_of(file), MAX_PARTS):
             if not spec.deep:
-                part_name = str(spec.getattribute("oiio:subimagename") or "") if several else ""
                 views += stated_views(spec)
                 found += _layers_in(part, part_name, spec)
-            part += 1
-        file.geterror()  # clears the error: the loop asked for a part that does not exist
     named = ((each, view_of(each.name, views)) for each in found)
     return [replace(each, view=view, base=base) for each, (view, base) in named]
 

@@ -1,19 +1,21 @@
 """Reads the colour chunks of a PNG (PNG specification, third edition, 2025)."""
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+from clpipe.images import colour_names
 
 MAGIC = b"\x89PNG\r\n\x1a\n"
 MAX_CHUNKS = 1000  # chunks before the first chunk of samples
 
 # Codes of ITU-T H.273 (2024). Table 2: x and y of red, green, blue and white. Table 3: curves.
 PRIMARIES = {
-    1: (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
-    9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+    1: colour_names.PRIMARIES["rec709"],
+    9: colour_names.PRIMARIES["rec2020"],
     11: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.314, 0.351),
-    12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+    12: colour_names.PRIMARIES["p3d65"],
 }
 CURVES = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 8: "linear", 13: "srgb", 16: "PQ", 18: "HLG"}
 SRGB_GAMMA = 1 / 2.2
@@ -42,7 +44,17 @@ def read_chunks(path: Path) -> dict[bytes, bytes]:
     Raises:
         OSError: the file cannot be read.
     """
-    return dict(_chunks(path))
+    chunks: dict[bytes, bytes] = {}
+    with path.open("rb") as file:
+        file.seek(len(MAGIC))
+        for _ in range(MAX_CHUNKS):
+            head = file.read(8)
+            if len(head) < 8 or head[4:] == b"IDAT":
+                break
+            (size,) = struct.unpack(">I", head[:4])
+            chunks[head[4:]] = file.read(size) if size <= 32 else b""
+            file.seek(size - len(chunks[head[4:]]) + 4, 1)
+    return chunks
 
 
 def png_colours(chunks: Mapping[bytes, bytes]) -> PngColours:
@@ -66,17 +78,3 @@ def png_colours(chunks: Mapping[bytes, bytes]) -> PngColours:
         white, colours = (values := struct.unpack(">8I", chunks[b"cHRM"]))[:2], values[2:]
         chromaticities = tuple(value / 100_000 for value in (*colours, *white))
     return PngColours(chromaticities, curve, "gAMA")
-
-
-def _chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield name and content of each chunk before the samples; b"" for a long content."""
-    with path.open("rb") as file:
-        file.seek(len(MAGIC))
-        for _ in range(MAX_CHUNKS):
-            head = file.read(8)
-            if len(head) < 8 or head[4:] == b"IDAT":
-                return
-            (size,) = struct.unpack(">I", head[:4])
-            content = file.read(size) if size <= 32 else b""
-            file.seek(size - len(content) + 4, 1)
-            yield head[4:], content

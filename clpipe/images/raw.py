@@ -1,13 +1,12 @@
 """Reading camera raws: CR2, NEF, ARW, DNG and the other formats of LibRaw, with a Bayer mosaic.
 
-This is the only module that imports rawpy and exifread.
+This is the only module that imports rawpy.
 """
 
 import io
-import logging
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
-from clpipe.base.reading import check_regular, read_start
-from clpipe.base.types import Array, Floats
+from clpipe.base.reading import read_start
+from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.profile import SRGB_TO_XYZ, Matrix
 from clpipe.images.dng import ARRAY_SEPARATOR, D65
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, MAX_PIXELS, check_size
-from clpipe.images.tags import DATE
+from clpipe.images.tags import DATE_PATTERN, FLIPS
+from clpipe.images.tiff import read_directories
 from clpipe.images.two_lights import TEMPERATURES, Light, camera_to_srgb
 from clpipe.images.vocabularies import dng_warnings, raw_compression
 from clpipe.reference.cfa import PATTERNS
@@ -39,20 +39,18 @@ MAX_GAIN = 8.0  # largest white balance gain; the smallest is its inverse
 
 # Converts LibRaw's flip to EXIF's orientation. The flip is a sum of 1 (mirror horizontally),
 # 2 (mirror vertically) and 4 (then transpose).
-ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}
+ORIENTATIONS = {int(np.dot(flips, (1, 2, 4))): number for number, flips in FLIPS.items()}
 
 # The bytes before the EXIF in files that are not TIFF: in a CR3's boxes, in a RAF's JPEG.
 EXIF_MARKS = (b"CMT1", b"CMT2", b"Exif\0\0")
-MODEL = "Tag 0xC614"  # UniqueCameraModel of a DNG
-TAG_PREFIXES = ("EXIF", "Image")  # exifread's prefixes of tags, in order of preference
-EXIF_BYTES = 1 << 20  # largest size of a tag, and of the part of a file searched for EXIF_MARKS
-MAX_READS = 200_000  # values; exifread reads each one separately, and 1,000 are usual
-DATE_TAGS = ("DateTimeOriginal", "DateTime")
+EXIF_BYTES = 1 << 20  # size of the part of a file that is searched for EXIF_MARKS
+EXIF_VERSION = 36864  # only the EXIF directory has this tag
+MAKE, MODEL, UNIQUE_MODEL = 271, 272, 50708
+EXPOSURE_TIME, F_NUMBER, ISO, FOCAL_LENGTH = 33434, 33437, 34855, 37386
+DATES = (36867, 306)  # DateTimeOriginal, DateTime
 # Tags of a DNG: illuminant, color matrix and calibration of the camera, for two lights.
-LIGHT_TAGS = ("0xC65A", "0xC621", "0xC623"), ("0xC65B", "0xC622", "0xC624")
-ANALOG_BALANCE = "0xC627"
-# Tags of a DNG's color matrices, and of their illuminants.
-COLOR_MATRICES = {"0xC622": "0xC65B", "0xC621": "0xC65A"}
+LIGHT_TAGS = (50778, 50721, 50723), (50779, 50722, 50724)
+ANALOG_BALANCE = 50727
 DUMP_HINT = "if it is a headerless dump of samples, add --dump WxH:TYPE"
 OTHER_FORMATS = {b"\xff\xd8\xff": "a JPEG", b"\x89PNG": "a PNG", b"v/1\x01": "an OpenEXR image"}
 
@@ -103,9 +101,9 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
     with _open_raw(path, max_pixels) as raw:
         pattern = _pattern(path, raw, exif)
         speed, shutter, aperture, focal_length = _exposure_values(raw)
-        iso = speed or exif.number("ISOSpeedRatings", 0)
-        exposure = exif.number("ExposureTime", shutter)
-        if not (exif.tags or iso or exposure):
+        iso = speed or exif.number(ISO, 0)
+        exposure = exif.number(EXPOSURE_TIME, shutter)
+        if not (exif.directories or iso or exposure):
             raise ImageError(f"{path}: this raw states no camera, ISO or exposure; {DUMP_HINT}")
         size = raw.sizes
         by_colour = raw.black_level_per_channel
@@ -121,8 +119,8 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
         if (lights := exif.lights()) and min(red, green, blue) > 0:
             to_srgb = _matrix(camera_to_srgb(*lights, green / np.array([red, green, blue]))[0])
         return RawInfo(
-            make=exif.text("Make") or "unknown",
-            model=exif.text("Model").removeprefix(SIMULATED) or "unknown",
+            make=exif.text(MAKE) or "unknown",
+            model=exif.text(MODEL).removeprefix(SIMULATED) or "unknown",
             iso=iso or None,
             exposure=exposure,
             visible_area=(size.left_margin, size.top_margin, size.width, size.height),
@@ -134,9 +132,9 @@ def read_raw_info(path: Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> RawInfo:
             xyz_to_camera=exif.color_matrix() if matrix is None else matrix,
             camera_to_srgb=to_srgb,
             orientation=ORIENTATIONS.get(size.flip, 1),
-            aperture=exif.number("FNumber", aperture),
-            focal_length=exif.number("FocalLength", focal_length),
-            taken=next(filter(DATE.fullmatch, map(exif.text, DATE_TAGS)), ""),
+            aperture=exif.number(F_NUMBER, aperture),
+            focal_length=exif.number(FOCAL_LENGTH, focal_length),
+            taken=next(filter(DATE_PATTERN.fullmatch, map(exif.text, DATES)), ""),
             unused=tuple(dng_warnings(path)),
         )
 
@@ -267,7 +265,7 @@ def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
         )
     if raw.num_colors == 1:
         return MONO
-    array = exif.text(MODEL).partition(ARRAY_SEPARATOR)[2]  # LibRaw may misread this array
+    array = exif.text(UNIQUE_MODEL).partition(ARRAY_SEPARATOR)[2]  # LibRaw may misread this array
     if {*array} - {*"RGB/"}:
         raise ImageError(
             f"{path}: its filter array is {array}. clpipe only reads DNG files whose array has "
@@ -290,60 +288,54 @@ def _pattern(path: Path, raw: Any, exif: "Exif") -> str:
 
 @dataclass(frozen=True)
 class Exif:
-    """The EXIF tags of a file, by exifread's names."""
+    """The tags of a file: the values of each directory by tag, the EXIF directory first."""
 
-    tags: dict[str, Any]
+    directories: Sequence[Mapping[int, tuple[Any, ...]]]
 
-    def text(self, name: str) -> str:
-        """Return the text of a tag in the first part that has it; "" if none has."""
-        texts = (str(self.tags.get(f"{part} {name}", "")).strip("\0 ") for part in TAG_PREFIXES)
-        return next((text for text in texts if text), "")
+    def values(self, tag: int) -> tuple[Any, ...]:
+        """Return the values of a tag in the first directory that has it; () if none has."""
+        return next((each[tag] for each in self.directories if tag in each), ())
 
-    def number(self, name: str, default: float) -> float | None:
+    def text(self, tag: int) -> str:
+        """Return the text of a tag; "" if there is none."""
+        return str(*self.values(tag)[:1]).strip()
+
+    def number(self, tag: int, default: float) -> float | None:
         """Return a tag's first number, or ``default``; None unless it is finite and above 0."""
-        value = default
-        for part in TAG_PREFIXES:
-            if tag := self.tags.get(f"{part} {name}"):
-                try:
-                    value = float(tag.values[0])
-                except (AttributeError, IndexError, TypeError, ValueError, ZeroDivisionError):
-                    value = 0
-                break
-        return value if 0 < value < math.inf else None
+        value = next(iter(self.values(tag)), default)
+        is_number = isinstance(value, int | float) and 0 < value < math.inf
+        return float(value) if is_number else None
+
+    def numbers(self, tag: int, *shape: int) -> Doubles | None:
+        """Return the numbers of a tag as an array of a shape; None unless it has this many."""
+        with suppress(ValueError):
+            return np.array(self.values(tag), np.float64).reshape(shape)
+        return None
 
     def color_matrix(self) -> Matrix | None:
         """Return the ColorMatrix of a DNG for D65, from CIE XYZ; None if there is none."""
-        for name, illuminant in COLOR_MATRICES.items():
-            if self.number(f"Tag {illuminant}", 0) == D65 and f"Image Tag {name}" in self.tags:
-                with suppress(TypeError, ValueError, ZeroDivisionError):
-                    values = [float(value) for value in self.tags[f"Image Tag {name}"].values]
-                    return _matrix(np.reshape(values, (3, 3)))
+        for illuminant, matrix, _ in reversed(LIGHT_TAGS):
+            colours = self.numbers(matrix, 3, 3)
+            if self.number(illuminant, 0) == D65 and colours is not None:
+                return _matrix(colours)
         return None
 
     def lights(self) -> tuple[Light, Light] | None:
         """Return a DNG's matrices for two lights; None unless it states both."""
         found = []
         for illuminant, matrix, calibration in LIGHT_TAGS:
-            temperature = TEMPERATURES.get(int(self.number(f"Tag {illuminant}", 0) or 0))
-            colours = self._numbers(matrix, 9)
-            if temperature is None or colours is None:
+            temperature = TEMPERATURES.get(int(self.number(illuminant, 0) or 0))
+            camera = self.numbers(matrix, 3, 3)
+            if temperature is None or camera is None:
                 return None
-            own, balance = self._numbers(calibration, 9), self._numbers(ANALOG_BALANCE, 3)
-            camera = np.reshape(colours, (3, 3))
-            camera = camera if own is None else np.reshape(own, (3, 3)) @ camera
+            own, balance = self.numbers(calibration, 3, 3), self.numbers(ANALOG_BALANCE, 3)
+            camera = camera if own is None else own @ camera
             camera = camera if balance is None else np.diag(balance) @ camera
             if _matrix(camera) is None:
                 return None
             found.append(Light(float(temperature), camera))
         one, two = found
         return (one, two) if one.temperature != two.temperature else None
-
-    def _numbers(self, name: str, count: int) -> list[float] | None:
-        """Return the numbers of a tag; None unless it has this many."""
-        with suppress(AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError):
-            values = [float(value) for value in self.tags[f"Image Tag {name}"].values]
-            return values if len(values) == count else None
-        return None
 
 
 def read_exif(path: Path) -> Exif:
@@ -353,44 +345,15 @@ def read_exif(path: Path) -> Exif:
         ImageError: the file cannot be read.
     """
     try:
-        check_regular(path)
-        with path.open("rb") as file:
-            tags = _tags(file)
-            if not tags:
-                file.seek(0)
-                head = file.read(EXIF_BYTES)
-                for mark in (m for m in EXIF_MARKS if m in head):
-                    tags |= _tags(io.BytesIO(head[head.index(mark) + len(mark) :]))
+        head = read_start(path, EXIF_BYTES)
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file") from None
     except OSError as error:
         raise ImageError(f"{path}: cannot be read: {error.strerror or error}") from None
-    return Exif(tags)
-
-
-class _LimitedReader:
-    """Wraps a file, and stops reading if its tags claim more values than are plausible."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._count = 0
-
-    def read(self, size: int = EXIF_BYTES) -> bytes:
-        self._count += 1
-        if self._count > MAX_READS:
-            raise ValueError
-        return self._file.read(min(size, EXIF_BYTES))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-
-def _tags(file: Any) -> dict[str, Any]:
-    """Return the EXIF tags of an open file; {} if it is damaged, which LibRaw reports better."""
-    import exifread
-
-    logging.getLogger("exifread").setLevel(logging.CRITICAL)
-    try:
-        return dict(exifread.process_file(_LimitedReader(file), details=False))
-    except Exception:  # exifread raises exceptions of any type for damaged files
-        return {}
+    directories = [*read_directories(path)] or [
+        directory
+        for mark in EXIF_MARKS
+        if mark in head
+        for directory in read_directories(io.BytesIO(head.partition(mark)[2]))
+    ]
+    return Exif(sorted(directories, key=lambda each: EXIF_VERSION not in each))

@@ -12,9 +12,9 @@ from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.types import Array
-from clpipe.images.layers import MAX_PARTS, PictureLocation, mosaic_channel, picture_channels
+from clpipe.images.layers import PictureLocation, mosaic_channel, picture_channels
 from clpipe.images.openexr import read_channels
-from clpipe.images.openimageio import damage_text, open_image, read_with_pillow
+from clpipe.images.openimageio import damage_text, open_image, parts_of, read_with_pillow
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS, check_size, display_window
 from clpipe.reference.geometry import Margins
 
@@ -85,8 +85,7 @@ def read_part(
     type_ = types.pop() if is_integer else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
     pixels = None
     if file.format_name() == "openexr" and not is_integer:
-        names = [spec.channelnames[i] for i in channels]
-        pixels = read_channels(path, names, (spec.height, spec.width))
+        pixels = read_channels(path, file, channels)
     if pixels is None:
         pixels = read_samples(path, file, location.part, channels, type_)
     if is_integer:
@@ -97,9 +96,7 @@ def read_part(
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])
 
 
-def read_whole_numbers(
-    path: Path, max_pixels: int = DEFAULT_MAX_PIXELS, colours: bool = False
-) -> Array:
+def read_whole_numbers(path: Path, colours: bool = False) -> Array:
     """Return the samples of a picture as they are stored, uint8 or uint16.
 
     They are its first channel, (height, width), or with ``colours`` its first three channels,
@@ -115,7 +112,7 @@ def read_whole_numbers(
                 f"{path}: this file has samples of type {spec.format}, but integers of 8 or 16 "
                 "bits are expected. Convert it to an 8- or 16-bit PNG or TIFF"
             )
-        check_size(path, spec.width, spec.height, max_pixels)
+        check_size(path, spec.width, spec.height, DEFAULT_MAX_PIXELS)
         samples = read_samples(path, file, 0, range(3 if colours else 1), spec.format.basetype)
         return samples if colours else samples[..., 0]
 
@@ -139,9 +136,7 @@ def holds_mosaic(path: Path) -> bool:
         ImageError: the file is missing, empty, damaged or not an image.
     """
     with open_image(path) as file:
-        parts: list[list[str]] = []
-        while len(parts) < MAX_PARTS and file.seek_subimage(len(parts), 0):
-            parts.append(list(file.spec().channelnames))
+        parts = [list(spec.channelnames) for _, _, spec in parts_of(file)]
     return not any(map(picture_channels, parts)) and any(map(mosaic_channel, parts))
 
 

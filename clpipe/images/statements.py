@@ -111,7 +111,8 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
     curve = ""
     chunks: Mapping[bytes, bytes] = {}
     if format_ == "png":
-        chunks = png_chunks(path)
+        with read_errors(path):
+            chunks = png.read_chunks(path)
         colours = png.png_colours(chunks)
         chromaticities = chromaticities or colours.chromaticities
         if colours.curve not in ("", "srgb", "linear"):
@@ -153,16 +154,6 @@ def _named_space(path: Path, spec: Any) -> tuple[ColourSpace | None, list[str]]:
     if space and space.encoding:
         warnings.append(f"its samples, encoded as {printable(space.name)}, were decoded")
     return space, warnings
-
-
-def png_chunks(path: Path) -> dict[bytes, bytes]:
-    """Return the chunks of a PNG before its samples, by name.
-
-    Raises:
-        ImageError: the file cannot be read.
-    """
-    with read_errors(path):
-        return png.read_chunks(path)
 
 
 def _profile(spec: Any) -> str:

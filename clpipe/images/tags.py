@@ -17,7 +17,7 @@ from clpipe.camera.optics import FILM_DIAGONAL
 from clpipe.images.encoding import Encoding
 
 TAG_ATTRIBUTES = ("exif", "orientation")  # attributes that contain an image's tags
-DATE = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # EXIF's format
+DATE_PATTERN = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")  # EXIF's format
 NOT_CARRIED = ("sensor_width", "encoding")  # fields of tags that attributes do not contain
 DAMAGED = "its attributes clpipe:exif and clpipe:orientation are damaged; write the file again"
 
@@ -67,21 +67,17 @@ def exif(tags: Tags, height: int, width: int) -> dict[str, float | str]:
     FocalPlaneYResolution 2500.0
     FocalPlaneResolutionUnit 3
     """
-    values: dict[str, float | str] = {"PhotographicSensitivity": min(round(tags.iso), 65535)}
-    if tags.exposure:
-        values["ExposureTime"] = tags.exposure
-    if tags.aperture:
-        values["FNumber"] = tags.aperture
-    if tags.bias is not None:
-        values["ExposureBiasValue"] = tags.bias
-    if tags.lens:
-        values["LensModel"] = tags.lens
-    if tags.focus_distance:
-        values["SubjectDistance"] = tags.focus_distance
-    if tags.taken:
-        values["DateTimeOriginal"] = tags.taken
-    if tags.focal_length:
-        values["FocalLength"] = tags.focal_length
+    stated = {
+        "PhotographicSensitivity": min(round(tags.iso), 65535),
+        "ExposureTime": tags.exposure,
+        "FNumber": tags.aperture,
+        "ExposureBiasValue": tags.bias,
+        "LensModel": tags.lens or None,
+        "SubjectDistance": tags.focus_distance,
+        "DateTimeOriginal": tags.taken or None,
+        "FocalLength": tags.focal_length,
+    }
+    values = {name: value for name, value in stated.items() if value is not None}
     if tags.sensor_width:
         per_mm = max(height, width) / tags.sensor_width
         if tags.focal_length:

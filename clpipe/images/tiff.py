@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from clpipe.base.types import Array
 
@@ -36,33 +36,29 @@ Directory = dict[int, Field]  # fields by tag number
 # those of BigTIFF.
 CODES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 6: "b", 7: "B", 8: "h", 9: "i", 10: "ii"}
 CODES |= {11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q"}
-SUB_DIRECTORIES = 330  # the tag with their offsets
+TEXT = 2
+BIG_TIFF = 43  # the version of files with offsets of 64 bits
+PARTS = (34665, 330)  # tags with the offsets of other directories: ExifIFD, SubIFDs
 MOST_DIRECTORIES = 64
 MOST_BYTES = 1 << 16  # of the values of a field; more are left out
+MOST_VALUES = 1 << 20  # of a file; more take too much time
 
 
-def _numbers(type_: int, code: str, *values: float) -> Field:
-    return Field(type_, len(values), struct.pack(f"<{len(values)}{code}", *values))
+def _field(type_: int, *values: float) -> Field:
+    code = CODES[type_]
+    pairs = map(fraction, values) if len(code) == 2 else zip(values)
+    data = struct.pack("<" + code * len(values), *chain.from_iterable(pairs))
+    return Field(type_, len(values), data)
 
 
-def _fractions(type_: int, code: str, *values: float) -> Field:
-    parts = [part for value in values for part in fraction(value)]
-    return Field(type_, len(values), struct.pack(f"<{len(parts)}{code}", *parts))
-
-
-byte = partial(_numbers, 1, "B")
-short = partial(_numbers, 3, "H")
-long = partial(_numbers, 4, "I")
-rational = partial(_fractions, 5, "I")
-signed_rational = partial(_fractions, 10, "i")
-float32 = partial(_numbers, 11, "f")
-double = partial(_numbers, 12, "d")
+MAKERS = {type_: partial(_field, type_) for type_ in (1, 3, 4, 5, 10, 11, 12)}
+byte, short, long, rational, signed_rational, float32, double = MAKERS.values()
 
 
 def text(value: str) -> Field:
     """Return an ASCII field: text, with ? for other characters, and a final NUL."""
     data = value.encode("ascii", "replace") + b"\0"
-    return Field(2, len(data), data)
+    return Field(TEXT, len(data), data)
 
 
 def fraction(value: float) -> tuple[int, int]:
@@ -142,41 +138,59 @@ def exif_fields(tags: Mapping[str, float | str]) -> Directory:
     return fields
 
 
-def read_directories(path: Path) -> Iterator[dict[int, tuple[float, ...]]]:
+def read_directories(source: Path | BinaryIO) -> Iterator[dict[int, tuple[Any, ...]]]:
     """Yield the values of a TIFF's first directory by their tags, then those of its parts.
 
-    Directories that are damaged, or of another format, are left out,
-    because the reader of the pixels reports it better.
+    The parts are its EXIF, then images. Text is one value. Directories that are damaged, or of
+    another format, are left out, because the reader of the pixels reports it better.
     """
-    with suppress(OSError, LookupError, OverflowError, struct.error), path.open("rb") as file:
+    with (
+        suppress(OSError, ValueError, LookupError, OverflowError, struct.error),
+        source.open("rb") if isinstance(source, Path) else source as file,
+    ):
         start = file.read(16)
         order = {b"II": "<", b"MM": ">"}[start[:2]]
         (version,) = struct.unpack_from(f"{order}H", start, 2)
-        big = {42: False, 43: True}[version]
+        big = version == BIG_TIFF  # other numbers are TIFF's and those of raws such as ORF and RW2
         offsets = [struct.unpack_from(f"{order}{'Q' if big else 'I'}", start, 8 if big else 4)[0]]
+        remaining = MOST_VALUES
         for offset in islice(offsets, MOST_DIRECTORIES):
-            directory = _read_directory(file, offset, order, big)
-            offsets += map(int, directory.get(SUB_DIRECTORIES, ()))
+            directory = _read_directory(file, offset, order, big, remaining)
+            remaining -= sum(map(len, directory.values()))
+            for tag in PARTS:
+                offsets += map(int, directory.get(tag, ()))
             yield directory
 
 
 def _read_directory(
-    file: BinaryIO, offset: int, order: str, big: bool
-) -> dict[int, tuple[float, ...]]:
+    file: BinaryIO, offset: int, order: str, big: bool, most_values: int
+) -> dict[int, tuple[Any, ...]]:
+    """Return the values of a directory by their tags.
+
+    Raises:
+        OSError, ValueError, LookupError, OverflowError, struct.error: it is damaged, or has more
+            than ``most_values``.
+    """
     count_code, entry_code, inside = ("Q", "HHQ8s", 8) if big else ("H", "HHI4s", 4)
     file.seek(offset)
     (count,) = struct.unpack(f"{order}{count_code}", file.read(8 if big else 2))
     entries = file.read(min(count, 1 << 16) * (20 if big else 12))
-    found: dict[int, tuple[float, ...]] = {}
+    found: dict[int, tuple[Any, ...]] = {}
     for tag, type_, number, data in struct.iter_unpack(f"{order}{entry_code}", entries):
-        codes = CODES.get(type_, "") * min(number, MOST_BYTES)
-        size = struct.calcsize(order + codes)
+        code = CODES.get(type_, "")
+        count = min(number, MOST_BYTES) if code else 0
+        most_values -= count
+        if most_values < 0:
+            raise ValueError
+        size = struct.calcsize(order + code) * count
         content = data[:size]
         if size > inside:
             file.seek(struct.unpack(f"{order}{'Q' if big else 'I'}", data)[0])
             content = file.read(size)
-        values = struct.unpack(order + codes, content)
-        if len(CODES.get(type_, "")) == 2:
+        values = struct.unpack(order + code * count, content)
+        if type_ == TEXT:
+            values = (content.partition(b"\0")[0].decode(errors="replace"),)
+        elif len(code) == 2:
             fractions = zip(values[::2], values[1::2], strict=True)
             values = tuple(above / below if below else 0.0 for above, below in fractions)
         found[tag] = values

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from PIL import TiffTags
+from PIL.ExifTags import TAGS
 
 from clpipe.base.vocabulary import Vocabulary
 from clpipe.images.attributes import PREFIX
@@ -152,36 +153,10 @@ JPEG = Vocabulary.of(
         },
     },
 )
-# Numbers of DNG's own tags.
-DNG_TAGS = {
-    50706: "DNGVersion", 50707: "DNGBackwardVersion", 50708: "UniqueCameraModel",
-    50709: "LocalizedCameraModel", 50710: "CFAPlaneColor", 50711: "CFALayout",
-    50712: "LinearizationTable", 50713: "BlackLevelRepeatDim", 50714: "BlackLevel",
-    50715: "BlackLevelDeltaH", 50716: "BlackLevelDeltaV", 50717: "WhiteLevel",
-    50718: "DefaultScale", 50719: "DefaultCropOrigin", 50720: "DefaultCropSize",
-    50721: "ColorMatrix1", 50722: "ColorMatrix2", 50723: "CameraCalibration1",
-    50724: "CameraCalibration2", 50725: "ReductionMatrix1", 50726: "ReductionMatrix2",
-    50727: "AnalogBalance", 50728: "AsShotNeutral", 50729: "AsShotWhiteXY",
-    50730: "BaselineExposure", 50731: "BaselineNoise", 50732: "BaselineSharpness",
-    50733: "BayerGreenSplit", 50734: "LinearResponseLimit", 50735: "CameraSerialNumber",
-    50736: "LensInfo", 50737: "ChromaBlurRadius", 50738: "AntiAliasStrength",
-    50739: "ShadowScale", 50740: "DNGPrivateData", 50741: "MakerNoteSafety",
-    50778: "CalibrationIlluminant1", 50779: "CalibrationIlluminant2", 50780: "BestQualityScale",
-    50781: "RawDataUniqueID", 50827: "OriginalRawFileName", 50828: "OriginalRawFileData",
-    50829: "ActiveArea", 50830: "MaskedAreas", 50831: "AsShotICCProfile",
-    50832: "AsShotPreProfileMatrix", 50833: "CurrentICCProfile", 50834: "CurrentPreProfileMatrix",
-    50879: "ColorimetricReference", 50931: "CameraCalibrationSignature",
-    50932: "ProfileCalibrationSignature", 50933: "ExtraCameraProfiles",
-    50934: "AsShotProfileName", 50935: "NoiseReductionApplied", 50936: "ProfileName",
-    50937: "ProfileHueSatMapDims", 50938: "ProfileHueSatMapData1", 50939: "ProfileHueSatMapData2",
-    50940: "ProfileToneCurve", 50941: "ProfileEmbedPolicy", 50942: "ProfileCopyright",
-    50964: "ForwardMatrix1", 50965: "ForwardMatrix2", 50966: "PreviewApplicationName",
-    50967: "PreviewApplicationVersion", 50968: "PreviewSettingsName",
-    50969: "PreviewSettingsDigest", 50970: "PreviewColorSpace", 50971: "PreviewDateTime",
-    50972: "RawImageDigest", 50973: "OriginalRawFileDigest", 50974: "SubTileBlockSize",
-    50975: "RowInterleaveFactor", 50981: "ProfileLookTableDims", 50982: "ProfileLookTableData",
-    51008: "OpcodeList1", 51009: "OpcodeList2", 51022: "OpcodeList3", 51041: "NoiseProfile",
-    51043: "TimeCodes", 51044: "FrameRate", 51058: "TStop", 51081: "ReelName",
+FIRST_DNG_TAG = 50706
+# Numbers of DNG's own tags: those that Pillow knows, and newer ones.
+DNG_TAGS = {tag: name for tag, name in TAGS.items() if tag >= FIRST_DNG_TAG} | {
+    50933: "ExtraCameraProfiles", 51043: "TimeCodes", 51058: "TStop", 51081: "ReelName",
     51089: "OriginalDefaultFinalSize", 51090: "OriginalBestQualityFinalSize",
     51091: "OriginalDefaultCropSize", 51105: "CameraLabel", 51107: "ProfileHueSatMapEncoding",
     51108: "ProfileLookTableEncoding", 51109: "BaselineExposureOffset", 51110: "DefaultBlackRender",
@@ -333,7 +308,9 @@ def vocabulary_warnings(path: Path, format_: str, spec: Any, chunks: Iterable[by
         is_other = space not in (None, EXIF_SRGB) and not has_profile
         return JPEG.warnings(["Exif:ColorSpace"] if is_other else ())
     if format_ == "tiff":
-        return TIFF.warnings(name for name in tiff_tags(path) if name not in OWN_SENTENCES)
+        # A damaged directory has no tags.
+        names = (TiffTags.lookup(tag).name for tag in next(read_directories(path), ()))
+        return TIFF.warnings(name for name in names if name not in OWN_SENTENCES)
     return []
 
 
@@ -341,11 +318,6 @@ def vocabulary_warnings(path: Path, format_: str, spec: Any, chunks: Iterable[by
 def _openexr_warnings(names: tuple[str, ...]) -> tuple[str, ...]:
     stated = (_OPENEXR_NAMES.get(name, name) for name in names if name not in OWN_SENTENCES)
     return tuple(OPENEXR.warnings(name for name in stated if not name.startswith(LIBRARY)))
-
-
-def tiff_tags(path: Path) -> list[str]:
-    """Return the names of the tags of a TIFF's first page; [] if they are damaged."""
-    return [TiffTags.lookup(tag).name for tag in next(read_directories(path), ())]
 
 
 def dng_warnings(path: Path) -> list[str]:
@@ -365,6 +337,6 @@ def raw_compression(path: Path) -> str:
     >>> raw_compression(Path("missing.dng"))
     ''
     """
-    found = [int(n) for each in read_directories(path) for n in each.get(COMPRESSION, ())]
+    found = [n for each in read_directories(path) for n in each.get(COMPRESSION, ())]
     names = [f"{COMPRESSIONS[n]} (number {n})" for n in found if n in COMPRESSIONS]
     return names[0] if names else ""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_json, read_named
@@ -30,18 +30,17 @@ class AnnotatedRender:
     content: Any
 
 
-class Annotations(Protocol):
-    """The annotations of several renders, in any supported format."""
+@dataclass(frozen=True)
+class Annotations:
+    """The annotations of several renders, in any supported format.
 
-    @property
-    def file(self) -> Path:
-        """The file or folder that they were read from."""
-        ...
+    Args:
+        file: the file or folder that they were read from.
+        renders: the annotated renders.
+    """
 
-    @property
-    def renders(self) -> Sequence[AnnotatedRender]:
-        """The annotated renders."""
-        ...
+    file: Path
+    renders: Sequence[AnnotatedRender]
 
 
 def read_json(path: Path) -> Any:
@@ -58,6 +57,15 @@ def read_json(path: Path) -> Any:
             f"--annotations {path}: this is not valid JSON ({error}); give COCO's .json, BOP's "
             "scene_gt.json, or a folder of KITTI labels"
         ) from None
+
+
+def are_numbers(values: Any, count: int | None = None) -> bool:
+    """Return whether a value is a list of coordinates; None allows any count."""
+    return (
+        isinstance(values, list)
+        and count in (None, len(values))
+        and all(type(v) in (int, float) and abs(v) <= MAX_COORDINATE for v in values)
+    )
 
 
 def reject(path: Path, place: str, found: Any, expected: str) -> NoReturn:

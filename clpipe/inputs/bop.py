@@ -5,7 +5,7 @@ mask and mask_visib contain a PNG for each object of each image:
 https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,11 @@ from typing import Any
 from clpipe.base.text import whole_number
 from clpipe.inputs.annotation_keys import BOP, name_unknown
 from clpipe.inputs.annotations import (
-    MAX_COORDINATE,
     MAX_PIXELS,
     AnnotatedRender,
+    Annotations,
     Record,
+    are_numbers,
     read_json,
     reject,
 )
@@ -45,17 +46,13 @@ class BopObject:
 
 
 @dataclass(frozen=True)
-class Bop:
-    """A scene, see :class:`~clpipe.inputs.annotations.Annotations`.
+class Bop(Annotations):
+    """A scene: a list of :class:`BopObject` for each image. The name of an image is its number.
 
     Args:
-        file: scene_gt.json.
-        renders: a list of :class:`BopObject` for each image. The name of an image is its number.
         cameras: the records of scene_camera.json, by the numbers of the images.
     """
 
-    file: Path
-    renders: Sequence[AnnotatedRender]
     cameras: Mapping[int, Record]
 
 
@@ -91,7 +88,7 @@ def read_bop(path: Path) -> Bop:
         renders.append(AnnotatedRender(f"{image:0{DIGITS}d}", None, found))
     for image, camera in cameras.items():
         matrix = camera.get("cam_K", [0] * 9) if isinstance(camera, dict) else None
-        if not isinstance(matrix, list) or len(matrix) != 9 or not all(map(_is_number, matrix)):
+        if not are_numbers(matrix, 9):
             reject(path.with_name(CAMERAS), f"{image}.cam_K", matrix, "nine numbers")
     objects_of_all = [each for render in renders for each in render.content]
     records = [record for each in objects_of_all for record in (each.pose, each.info)]
@@ -116,18 +113,12 @@ def _by_image(path: Path) -> dict[int, Record]:
 
 
 def _check(path: Path, place: str, info: Record) -> None:
-    for name in BOXES if isinstance(info, dict) else ():
-        box = info.get(name, [0] * 4)
-        if not isinstance(box, list) or len(box) != 4 or not all(_is_number(v) for v in box):
+    if not isinstance(info, dict):
+        reject(path, place, info, "an object")
+    for name in BOXES:
+        if not are_numbers(box := info.get(name, [0] * 4), 4):
             reject(path, f"{place}.{name}", box, "x, y, width and height")
-    for name in COUNTS if isinstance(info, dict) else ():
+    for name in COUNTS:
         count = info.get(name, 0)
         if not isinstance(count, int | float) or not 0 <= count <= MAX_PIXELS:
             reject(path, f"{place}.{name}", count, "a number of pixels")
-    if not isinstance(info, dict):
-        reject(path, place, info, "an object")
-
-
-def _is_number(value: Any) -> bool:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and abs(value) <= MAX_COORDINATE

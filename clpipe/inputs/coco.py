@@ -10,32 +10,30 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.inputs.annotation_keys import COCO, name_unknown
-from clpipe.inputs.annotations import MAX_COORDINATE, MAX_PIXELS, AnnotatedRender, Record, reject
+from clpipe.inputs.annotations import (
+    MAX_COORDINATE,
+    MAX_PIXELS,
+    AnnotatedRender,
+    Annotations,
+    Record,
+    are_numbers,
+    reject,
+)
 
 REQUIRED_LISTS = ("images", "annotations", "categories")
 
 
 @dataclass(frozen=True)
-class Coco:
-    """Annotations of renders, see :class:`~clpipe.inputs.annotations.Annotations`.
+class Coco(Annotations):
+    """Annotations of renders, each with its record in the file.
 
     Args:
-        file: the JSON file.
         values: all of its values.
         of_image: the annotations of each image, by the image's id.
     """
 
-    file: Path
     values: Mapping[str, Any]
     of_image: Mapping[Any, Sequence[Record]]
-
-    @property
-    def renders(self) -> list[AnnotatedRender]:
-        """The annotated renders, each with its record in the file."""
-        return [
-            AnnotatedRender(image["file_name"], (image["width"], image["height"]), image)
-            for image in self.values["images"]
-        ]
 
 
 def read_coco(path: Path, values: Any) -> Coco:
@@ -54,33 +52,35 @@ def read_coco(path: Path, values: Any) -> Coco:
     images, annotations, _ = lists
     assert images is not None and annotations is not None
     of_image: dict[Any, list[Record]] = {}
-    size_by_name: dict[str, tuple[int, int]] = {}
-    names: dict[Any, str] = {}
+    sizes: dict[Any, tuple[int, int]] = {}
+    names: set[str] = set()
+    renders: list[AnnotatedRender] = []
     for number, image in enumerate(images):
-        sizes = [image.get(name) for name in ("width", "height")]
-        if not all(isinstance(side, int) and 0 < side <= MAX_COORDINATE for side in sizes):
+        size = [image.get(name) for name in ("width", "height")]
+        if not all(isinstance(side, int) and 0 < side <= MAX_COORDINATE for side in size):
             allowed = f"whole px from 1 to {MAX_COORDINATE:.0f}"
-            reject(path, f"images[{number}]", f"width and height {sizes}", allowed)
+            reject(path, f"images[{number}]", f"width and height {size}", allowed)
         _check_id(path, f"images[{number}].id", image.get("id"))
         if not isinstance(image.get("file_name"), str) or image["id"] in of_image:
             found = "no file_name, or an id that another image has"
             reject(path, f"images[{number}]", found, "a file_name and a unique id")
-        if image["file_name"] in size_by_name:
+        if image["file_name"] in names:
             found = f"the file_name {image['file_name']} of an earlier image"
             reject(path, f"images[{number}]", found, "one entry for each file")
-        size_by_name[image["file_name"]] = (image["width"], image["height"])
+        names.add(image["file_name"])
+        sizes[image["id"]] = image["width"], image["height"]
+        renders.append(AnnotatedRender(image["file_name"], sizes[image["id"]], image))
         of_image[image["id"]] = []
-        names[image["id"]] = image["file_name"]
     for number, each in enumerate(annotations):
         place = f"annotations[{number}]"
         _check_id(path, f"{place}.image_id", each.get("image_id"))
         if each["image_id"] not in of_image:
             expected = "the id of an image in the list images"
             reject(path, place, f"image_id {each['image_id']!r}", expected)
-        _check(path, place, each, size_by_name[names[each["image_id"]]])
+        _check(path, place, each, sizes[each["image_id"]])
         of_image[each["image_id"]].append(each)
     name_unknown(path, COCO, [values, *images, *annotations])
-    return Coco(path, values, of_image)
+    return Coco(path, renders, values, of_image)
 
 
 def _check_id(path: Path, place: str, found: Any) -> None:
@@ -107,16 +107,16 @@ def _check(path: Path, place: str, annotation: Record, size: tuple[int, int]) ->
     """
     box, points = annotation.get("bbox"), annotation.get("keypoints", [])
     outline = annotation.get("segmentation", [])
-    if box is not None and not (_numbers(box) and len(box) == 4):
+    if box is not None and not are_numbers(box, 4):
         reject(path, f"{place}.bbox", box, "x, y, width and height")
-    if not _numbers(points) or len(points) % 3:
+    if not are_numbers(points) or len(points) % 3:
         reject(path, f"{place}.keypoints", points, "x, y and visibility of each keypoint")
     if isinstance(outline, dict):
         if not {"size", "counts"} <= outline.keys():
             reject(path, f"{place}.segmentation", list(outline), "size and counts")
         _check_mask(path, f"{place}.segmentation", outline, size)
     elif not isinstance(outline, list) or not all(
-        _numbers(part) and len(part) >= 6 and len(part) % 2 == 0 for part in outline
+        are_numbers(part) and len(part) >= 6 and len(part) % 2 == 0 for part in outline
     ):
         reject(path, f"{place}.segmentation", outline, "polygons of three points or more")
     if box is None and not outline:
@@ -178,9 +178,3 @@ def runs_of(counts: Any) -> list[int]:
     if shift:
         raise ValueError("they are incomplete")
     return runs
-
-
-def _numbers(values: Any) -> bool:
-    return isinstance(values, list) and all(
-        isinstance(v, int | float) and abs(v) <= MAX_COORDINATE for v in values
-    )

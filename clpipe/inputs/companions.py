@@ -20,13 +20,7 @@ from clpipe.reference.carried import RESAMPLING, LayerKind, Vector
 CARRIED = "carried"  # in file names: the carried layers of NAME are in NAME.carried.exr
 
 # Extensions of companions, in order of preference.
-SUFFIXES = (
-    ".exr",
-    ".pfm",
-    ".tif",
-    ".tiff",
-    ".png",
-)
+SUFFIXES = (".exr", ".pfm", ".tif", ".tiff", ".png")
 
 SEPARATORS = "_.-"  # in a companion's name, between the image's name and the layer's name
 
@@ -235,7 +229,8 @@ class LayerFinder:
                 f"channel{'s' * (len(location.channels) > 1)}, but a layer of {kind} needs "
                 f"{min_channels} or more; choose another kind with --carry {spec.name}:KIND"
             )
-        is_named = location.name and not (location.is_bare_channel and file != self.path)
+        is_bare_channel = location.channels == (location.name,)
+        is_named = location.name and not (is_bare_channel and file != self.path)
         layer = location.name if is_named else spec.name
         # A channel of a view, such as right.Z, is named like its layer.
         is_last = location.channels == (location.name.rpartition(".")[2],)

@@ -5,7 +5,7 @@ from itertools import groupby
 
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.inputs.companions import find_carried_layers
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.metering import with_drawn
 from clpipe.inputs.sequences import sequence_of

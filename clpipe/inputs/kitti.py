@@ -5,7 +5,7 @@ and rotation_y. Results add a score. The box is left, top, right and bottom, in 
 of the first pixel: https://www.cvlibs.net/datasets/kitti (the object development kit's readme).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,13 @@ from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_named_text
 from clpipe.base.types import Doubles
 from clpipe.inputs.annotation_keys import KITTI, name_unknown
-from clpipe.inputs.annotations import MAX_BYTES, MAX_COORDINATE, AnnotatedRender, reject
+from clpipe.inputs.annotations import (
+    MAX_BYTES,
+    MAX_COORDINATE,
+    AnnotatedRender,
+    Annotations,
+    reject,
+)
 
 FIELD_COUNT = 15  # fields of a line, without a score
 CALIBRATION = "calib"  # name of the calibration folder, next to the label folder
@@ -39,18 +45,14 @@ class KittiObject:
 
 
 @dataclass(frozen=True)
-class Kitti:
-    """A folder of KITTI labels, see :class:`~clpipe.inputs.annotations.Annotations`.
+class Kitti(Annotations):
+    """A folder of KITTI labels: a list of :class:`KittiObject` for each image.
 
     Args:
-        file: the folder.
-        renders: a list of :class:`KittiObject` for each image.
         calibrations: for each image, by its name, the numbers of each line of its calibration, by
             the name of the line.
     """
 
-    file: Path
-    renders: Sequence[AnnotatedRender]
     calibrations: Mapping[str, Mapping[str, Doubles]]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from clpipe.camera.lens import name_note
 from clpipe.chain.lens_presets import PRESETS
 from clpipe.chain.settings import Settings
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 
 
 def lens_notes(settings: Settings, jobs: Sequence[Job]) -> list[str]:

@@ -37,7 +37,7 @@ from clpipe.images.read import (
 from clpipe.images.video_reading import VIDEO_SUFFIXES
 from clpipe.inputs.carry import CarriedLayers, carry, merge_moments
 from clpipe.inputs.carry_panorama import carry_panorama
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.kept import KeptLoader, kind_message
 from clpipe.inputs.layers import read_step_layer
 from clpipe.inputs.manifest import check_rows

@@ -4,10 +4,9 @@ import csv
 import io
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
-from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import check_exists, read_bytes
@@ -22,6 +21,7 @@ from clpipe.chain.paths import resolve_paths
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.tables import (
     NON_SETTINGS,
     TEXT_COLUMNS,
@@ -34,42 +34,11 @@ from clpipe.inputs.times import decimal_text, time_of
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl", ".txt")
 # No other setting depends on these keys, and their values often differ by row.
-INDEPENDENT_KEYS = (
-    "seed",
-    "noise_key",
-)
+INDEPENDENT_KEYS = ("seed", "noise_key")
 MANIFEST_BYTES = 256 * 2**20  # bytes; enough for two million rows
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One image of a manifest.
-
-    Args:
-        path: the file.
-        key: its name among the inputs.
-        name: the path of its outputs in the output directory, without extension; "" uses the key.
-        values: its settings, nested like a configuration.
-        frames: the number of frames; None uses the request's number.
-        location: the manifest and the row, for messages.
-        time: when it was taken, in s; None is not known.
-    """
-
-    path: Path
-    key: str
-    name: str
-    values: Mapping[str, Any]
-    frames: int | None
-    location: str
-    time: Fraction | None = None
-
-    @property
-    def stem(self) -> str:
-        """The path of its outputs in the output directory, without extension."""
-        return self.name or str(PurePosixPath(self.key).with_suffix(""))
-
-
-def read_manifest(path: Path) -> list[Row]:
+def read_manifest(path: Path) -> list[Job]:
     """Return the rows of a manifest.
 
     A .csv file is UTF-8 text with a header and commas between cells. A cell is a TOML value, or
@@ -99,8 +68,8 @@ def read_manifest(path: Path) -> list[Row]:
     if text.startswith("#"):  # EuroC's data.csv
         read = list_records
     errors: list[str] = []
-    rows: list[Row] = []
-    by_stem: dict[str, Row] = {}
+    rows: list[Job] = []
+    by_stem: dict[str, Job] = {}
     shared_values: dict[str, Mapping[str, Any]] = {}  # values that rows share are checked once
     for line, record in read(path, text, _check_column):
         location = f"{path}, row {line}"
@@ -122,7 +91,7 @@ def read_manifest(path: Path) -> list[Row]:
     return rows
 
 
-def manifest_text(folder: Path, rows: Sequence[Row]) -> bytes:
+def manifest_text(folder: Path, rows: Sequence[Job]) -> bytes:
     """Return the bytes of a .csv that :func:`read_manifest` reads back as these rows.
 
     Args:
@@ -161,26 +130,15 @@ def _cell(value: Any) -> str:
     return value if is_plain else value_text(value)
 
 
-class ImageSettings(Protocol):
-    """An image with its own settings, such as a :class:`Row`."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def values(self) -> Mapping[str, Any]: ...
-    @property
-    def location(self) -> str: ...
-
-
 def check_rows(
-    rows: Iterable[ImageSettings],
+    rows: Iterable[Job],
     settings: Settings,
     has_embedded_settings: Callable[[Path], bool] = lambda path: False,
 ) -> list[Settings]:
     """Return the settings of each row, with every value checked and nothing drawn.
 
     Args:
-        rows: rows of a manifest, or jobs made from them.
+        rows: the jobs.
         settings: the settings for what a row does not set.
         has_embedded_settings: returns whether an image contains settings, like a raw. Such an image
             may have another camera and other stages.
@@ -276,7 +234,7 @@ def _check_column(name: str) -> None:
 
 def _row(
     folder: Path, location: str, record: Mapping[str, Any], shared: dict[str, Mapping[str, Any]]
-) -> Row:
+) -> Job:
     """Return a row, from its values by column.
 
     Args:
@@ -313,7 +271,7 @@ def _row(
     stamp = record.get("time")
     time = None if stamp is None else time_of(stamp)
     shared_values = shared.setdefault(repr(values), values)
-    return Row(image_path, key, name, shared_values, frames, location, time)
+    return Job(image_path, key, name, True, shared_values, frames, location=location, time=time)
 
 
 def check_output_name(name: str, column: str = "name") -> None:

@@ -25,9 +25,9 @@ from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result
 from clpipe.engine.service import Frame
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
-from clpipe.inputs.manifest import Row, manifest_text
+from clpipe.inputs.manifest import manifest_text
 from clpipe.inputs.sequences import sequence_of
 from clpipe.stage import StageRole
 from clpipe.stages.exposure.auto import Auto
@@ -261,10 +261,9 @@ def write_exposures(path: Path, jobs: Sequence[Job]) -> None:
     """
     rows = []
     for job in jobs:
-        own = job.values, job.frames, job.location, job.time
         for file in job.paths:
             is_named = file is job.path and not job.is_panorama  # a panorama's key names no view
             key = job.key if is_named else str(PurePosixPath(job.key).with_name(file.name))
             name = f"{job.name}.{file.stem}" if job.name and file is not job.path else job.name
-            rows.append(Row(file, key, name, *own))
+            rows.append(replace(job, path=file, key=key, name=name))
     write_new(path, manifest_text(path.parent, rows))

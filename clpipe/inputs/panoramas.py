@@ -13,7 +13,7 @@ from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
 from clpipe.inputs.companions import SEPARATORS
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.poses import stem_of
 from clpipe.inputs.render_cameras import read_views
 from clpipe.inputs.subframes import check_values, with_file_records
@@ -88,7 +88,10 @@ def rig_for(wide: WideAngle) -> Rig:
             one point.
     """
     if wide.views is None:
-        return Rig({name: (rotation, None) for name, rotation in CUBE.items()}, _angle(wide))
+        return Rig(
+            {name: (rotation, None) for name, rotation in CUBE.items()},
+            wide.face_angle or RIGHT_ANGLE,
+        )
     path, parameter = Path(wide.views), f"{stage_in(StageRole.VIEW).name}.views"
     try:
         read = read_views(path)
@@ -113,10 +116,6 @@ def rig_for(wide: WideAngle) -> Rig:
             "panorama are taken from one point; render them all from the same position"
         )
     return Rig(views, source=str(path))
-
-
-def _angle(wide: WideAngle) -> float:
-    return wide.face_angle or RIGHT_ANGLE
 
 
 def group_panoramas(jobs: Sequence[Job], wide: WideAngle | None) -> list[Job]:

@@ -17,7 +17,7 @@ from clpipe.chain.methods import make_model
 from clpipe.chain.options import Moments
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.claims import display_size
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.render_cameras import View, read_views
 
 EXTENSION = re.compile(r"\.[A-Za-z]\w{1,4}$")  # the extension of an image; frame.0001 has none

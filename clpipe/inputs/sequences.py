@@ -17,7 +17,7 @@ from clpipe.base.text import one_line, printable
 from clpipe.base.urls import may_be_url
 from clpipe.images.layers import find_picture
 from clpipe.images.openimageio import open_image
-from clpipe.inputs.find import Job, Place
+from clpipe.inputs.jobs import Job, Place
 from clpipe.inputs.times import decimal_text, seconds_of, standard_rate, timing_of
 
 log = logging.getLogger(__name__)

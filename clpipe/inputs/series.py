@@ -11,7 +11,7 @@ from clpipe.base.text import as_texts
 from clpipe.camera.profile import load_camera
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import Settings
 from clpipe.images.read import SourceImage
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.sequences import by_pattern, numbers_of
 from clpipe.reference.geometry import Margins
 from clpipe.stage import Span, StageRole
@@ -104,67 +104,52 @@ def average(
     Raises:
         ImageError: a frame cannot be read, is not in linear light, or has another size.
     """
-    exposure = _Exposure(job, shutter, spans)
+    found: list[SourceImage] = []  # without pixels
+    # For each of ``spans``, the weights of a frame, and extra weights of its light layer.
+    weights: list[tuple[Doubles, Doubles]] = []
+    totals: Floats = np.empty(0, np.float32)
     for number, path in enumerate(job.paths):
-        exposure.add(number, path, read)
-    found, totals = exposure.found, exposure.totals
-    averaged = replace(found[0], pixels=totals[0], later=tuple(totals[1:]))
-    return with_file_records(averaged, job, found)
-
-
-class _Exposure:
-    """The sums of an exposure's frames, one for each of ``spans``, and what the files state.
-
-    A frame's pixels are freed when :meth:`add` returns, before the next frame is read.
-    """
-
-    def __init__(self, job: Job, shutter: Rows, spans: tuple[Span, ...]) -> None:
-        self._job, self._shutter, self._spans = job, shutter, spans
-        self.found: list[SourceImage] = []  # without pixels
-        self.totals: Floats = np.empty(0, np.float32)
-        # Weights of a frame, and extra weights of its light layer.
-        self._weights: list[tuple[Doubles, Doubles]] = []
-
-    def add(self, number: int, path: Path, read: Callable[[Path, str | None], SourceImage]) -> None:
-        """Add a frame to the sums.
-
-        Raises:
-            ImageError: as for :func:`average`.
-        """
-        layer = self._shutter.light_layer
         with check_unchanged(path):
             source = read(path, None)
-            light = read(path, layer) if layer else None
+            light = read(path, shutter.light_layer) if shutter.light_layer else None
         pixels = source.pixels
         if pixels.ndim != 3:
             raise ImageError(
                 f"{path}: this is a mosaic, but only renders can be sub-frames; set "
                 f"{stage_in(StageRole.SHUTTER).name}.subframes=1"
             )
-        if not self.found:
-            self._begin(source)
-        elif (pixels.shape, source.margins) != (self.totals.shape[1:], self.found[0].margins):
-            first = _size(self.found[0], self.totals[0])
+        if not found:
+            weights = _weights_of_spans(job, source, shutter, spans)
+            totals = np.zeros((len(spans), *pixels.shape), np.float32)
+        elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
-                f"{path}: the size of this frame is {_size(source, pixels)}, but {self._job.path}, "
-                f"in the same exposure, has {first}; render all frames at one size"
+                f"{path}: the size of this frame is {_size(source, pixels)}, but {job.path}, in "
+                f"the same exposure, has {_size(found[0], totals[0])}; render all frames at one "
+                "size"
             )
-        for total, (unlit, extra) in zip(self.totals, self._weights, strict=True):
+        for total, (unlit, extra) in zip(totals, weights, strict=True):
             _add(total, unlit[number], pixels)
             if light:
                 _add(total, extra[number], light.pixels)
         warnings = (*source.warnings, *(light.warnings if light else ()))
-        self.found.append(replace(source, pixels=np.empty(0, pixels.dtype), warnings=warnings))
+        found.append(replace(source, pixels=np.empty(0, pixels.dtype), warnings=warnings))
+        del source, light, pixels  # before the next frame is read
+    averaged = replace(found[0], pixels=totals[0], later=tuple(totals[1:]))
+    return with_file_records(averaged, job, found)
 
-    def _begin(self, source: SourceImage) -> None:
-        """Compute the weights, from the size and the exposure time of the first frame."""
-        shutter = self._shutter.with_defaults(exposure_time=source.shot.get("exposure_time"))
-        size = len(self._job.paths), source.pixels.shape[0], source.margins
-        for number in range(len(self._spans)):
-            sub_shutter = shutter.for_exposure(self._spans, number)
-            unlit, lit = (weights_of(sub_shutter, *size, lit=is_lit) for is_lit in (False, True))
-            self._weights.append((unlit, lit - unlit))
-        self.totals = np.zeros((len(self._spans), *source.pixels.shape), np.float32)
+
+def _weights_of_spans(
+    job: Job, first: SourceImage, shutter: Rows, spans: tuple[Span, ...]
+) -> list[tuple[Doubles, Doubles]]:
+    """Return for each exposure the weights of frames, and extra weights of their light layers."""
+    shutter = shutter.with_defaults(exposure_time=first.shot.get("exposure_time"))
+    size = len(job.paths), first.pixels.shape[0], first.margins
+    weights = []
+    for number in range(len(spans)):
+        sub_shutter = shutter.for_exposure(spans, number)
+        unlit, lit = (weights_of(sub_shutter, *size, lit=is_lit) for is_lit in (False, True))
+        weights.append((unlit, lit - unlit))
+    return weights
 
 
 def with_file_records(image: SourceImage, job: Job, sources: Sequence[SourceImage]) -> SourceImage:

@@ -1,16 +1,17 @@
 """Writes annotations of pictures in the format of the renders' annotations: COCO, KITTI or BOP."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.files import write_new
 from clpipe.base.types import Array, Doubles
-from clpipe.images.openimageio import read_grey
+from clpipe.images.samples import read_whole_numbers
 from clpipe.images.write import write_png
 from clpipe.inputs.annotations import AnnotatedRender, Annotations, Record
 from clpipe.inputs.bop import BOXES, CAMERAS, COUNTS, DIGITS, INFOS, MASKS, POSES, Bop, BopObject
@@ -28,9 +29,10 @@ CAMERA_MATRIX = (0, 4, 2, 5)  # the indices of fx, fy, cx and cy in a camera mat
 ORIENTATION_ERROR = "flipped and rotated patches have no poses; run without --augment"
 
 
-class AnnotationWriter(Protocol):
+class AnnotationWriter(ABC):
     """Collects the annotations of an output directory's pictures, and writes them."""
 
+    @abstractmethod
     def add(self, file: str, mapping: PixelMapping, render: AnnotatedRender) -> int:
         """Add the annotations of a picture.
 
@@ -45,15 +47,14 @@ class AnnotationWriter(Protocol):
         Raises:
             ImageError: the annotations cannot be mapped.
         """
-        ...
 
+    @abstractmethod
     def write(self, folder: Path) -> list[Path]:
         """Write all annotations, and return the files and folders that were written.
 
         Raises:
             ImageError: a file cannot be written.
         """
-        ...
 
 
 def annotation_writer(annotations: Annotations) -> AnnotationWriter:
@@ -66,8 +67,8 @@ def annotation_writer(annotations: Annotations) -> AnnotationWriter:
     return CocoWriter(annotations)
 
 
-class CocoWriter:
-    """COCO: one file for all pictures. See :class:`AnnotationWriter`."""
+class CocoWriter(AnnotationWriter):
+    """COCO: one file for all pictures."""
 
     def __init__(self, coco: Coco) -> None:
         self._coco = coco
@@ -75,7 +76,6 @@ class CocoWriter:
         self._annotations: list[Record] = []
 
     def add(self, file: str, mapping: PixelMapping, render: AnnotatedRender) -> int:
-        """See :meth:`AnnotationWriter.add`."""
         source, (width, height) = render.content, mapping.picture_size
         mapped = [
             {**each, **changes}
@@ -90,17 +90,14 @@ class CocoWriter:
         return len(mapped)
 
     def write(self, folder: Path) -> list[Path]:
-        """See :meth:`AnnotationWriter.write`."""
         lists = {"images": self._images, "annotations": self._annotations}
         path = folder / ANNOTATIONS
         write_new(path, json_text({**self._coco.values, **lists}).encode())
         return [path]
 
 
-class KittiWriter:
+class KittiWriter(AnnotationWriter):
     """KITTI: a label per picture, and a calibration if its render has one.
-
-    See :class:`AnnotationWriter`.
 
     Positions and angles are in camera space and do not change. Objects that cover less than half a
     square pixel of the picture are dropped.
@@ -111,7 +108,6 @@ class KittiWriter:
         self._texts: dict[str, str] = {}
 
     def add(self, file: str, mapping: PixelMapping, render: AnnotatedRender) -> int:
-        """See :meth:`AnnotationWriter.add`."""
         if mapping.is_reoriented:
             raise ImageError(ORIENTATION_ERROR)
         lines = [line for each in render.content if (line := _kitti_line(each, mapping))]
@@ -122,7 +118,6 @@ class KittiWriter:
         return len(lines)
 
     def write(self, folder: Path) -> list[Path]:
-        """See :meth:`AnnotationWriter.write`."""
         for name, text in self._texts.items():
             write_new(folder / name, text.encode())
         return [folder / name for name in dict.fromkeys(name.split("/")[0] for name in self._texts)]
@@ -158,10 +153,8 @@ def _kitti_calibration(calibration: Mapping[str, Doubles], mapping: PixelMapping
     return "".join(lines)
 
 
-class BopWriter:
+class BopWriter(AnnotationWriter):
     """BOP: scene_gt.json, scene_gt_info.json, scene_camera.json and masks.
-
-    See :class:`AnnotationWriter`.
 
     Poses are in camera space and do not change. Images have the numbers of their renders if each
     render has one picture. Otherwise they are numbered from 0. scene_camera.json lists their files.
@@ -172,7 +165,6 @@ class BopWriter:
         self._pictures: list[tuple[str, AnnotatedRender, Record, list[_WarpedObject]]] = []
 
     def add(self, file: str, mapping: PixelMapping, render: AnnotatedRender) -> int:
-        """See :meth:`AnnotationWriter.add`."""
         if mapping.is_reoriented:
             raise ImageError(ORIENTATION_ERROR)
         camera: Record = {"file_name": file}
@@ -188,7 +180,6 @@ class BopWriter:
         return sum(each.is_in_picture for each in objects)
 
     def write(self, folder: Path) -> list[Path]:
-        """See :meth:`AnnotationWriter.write`."""
         names = [render.name for _, render, _, _ in self._pictures]
         one_picture_each = len(set(names)) == len(names)
         poses: Record = {}
@@ -259,7 +250,7 @@ def _mask(path: Path, mapping: PixelMapping) -> Array:
     Raises:
         ImageError: the file cannot be read, or differs from the render in size.
     """
-    mask = read_grey(path)
+    mask = read_whole_numbers(path)
     if mask.shape[1::-1] != (mapping.width, mapping.height):
         raise ImageError(
             f"{path}: this mask has {mask.shape[1]}x{mask.shape[0]} pixels, but its render has "

@@ -11,13 +11,7 @@ from clpipe.base.types import Array, Doubles, Mask
 from clpipe.inputs.annotations import Record
 from clpipe.inputs.coco import runs_of
 from clpipe.reference.carried import Layer, warp
-from clpipe.reference.geometry import (
-    Composition,
-    Geometry,
-    Margins,
-    Orientation,
-    destinations,
-)
+from clpipe.reference.geometry import Composition, Geometry, Margins, Orientation, destinations
 from clpipe.reference.intrinsics import Intrinsics
 
 SEGMENT_LENGTH = 2.0  # px; the length of the segments into which an outline is divided

@@ -25,12 +25,7 @@ from clpipe.outputs.annotation_warp import PixelMapping
 from clpipe.outputs.output_pictures import picture_of
 from clpipe.outputs.plan import file_suffix
 from clpipe.outputs.sidecar import SidecarError, sidecar_files, values_at
-from clpipe.reference.geometry import (
-    Composition,
-    Crop,
-    Margins,
-    Orientation,
-)
+from clpipe.reference.geometry import Composition, Crop, Margins, Orientation
 
 LENGTH_KEYS = ("focal_length", "sensor_width")  # an image's metadata may contain these
 

@@ -16,7 +16,7 @@ from clpipe.base.files import sha256_of
 from clpipe.base.system import open_plain
 from clpipe.base.urls import url_of
 from clpipe.images.whole import is_complete
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.outputs.plan import OutputPlan, RenditionFiles
 from clpipe.outputs.program import program_digest
 from clpipe.outputs.sidecar import (

@@ -12,7 +12,8 @@ from clpipe.base.errors import RequestError
 from clpipe.base.files import shorten_name
 from clpipe.base.memory import format_bytes
 from clpipe.base.system import LOCKABLE_BYTES, close_and_remove, lock_range, open_plain, reserve
-from clpipe.inputs.find import Job, Shard
+from clpipe.inputs.find import Shard
+from clpipe.inputs.jobs import Job
 from clpipe.outputs.patches import without_patch
 
 RESUMABLE = "finished pictures are kept, and the same command resumes"

@@ -20,7 +20,7 @@ from clpipe.chain.rendition import (
 )
 from clpipe.chain.request import ResolvedRequest
 from clpipe.inputs.companions import CARRIED
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.outputs.carried import png_suffix
 from clpipe.outputs.negative import dng_of
 from clpipe.outputs.patches import Patches, patch_name, variance_steps

@@ -17,7 +17,7 @@ from clpipe.engine.state import has_state
 from clpipe.images.read import SourceImage
 from clpipe.images.tags import FLIPS, orientation_of
 from clpipe.inputs.carry import CarriedLayers
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.motion import motion_records, row_times
 from clpipe.outputs.patches import Patch, metadata_of
@@ -26,6 +26,8 @@ from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.sidecar import VERSION_KEY, CachedJson, sidecar_bytes
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.stage import ImageLayer
+
+PLACE = "place"  # the entry of a picture that depends on the frames before, with its place
 
 METADATA, PATCHES = "facts", "patches"  # keys of a sidecar of patches
 
@@ -67,9 +69,6 @@ def layer_records(layers: Iterable[ImageLayer]) -> dict[str, list[Mapping[str, A
     for layer in layers:
         records.setdefault(layer.kind, []).append(layer.record)
     return records
-
-
-PLACE = "place"  # the entry of a picture that depends on the frames before, with its place
 
 
 def picture_record(

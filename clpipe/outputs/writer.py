@@ -18,7 +18,7 @@ from clpipe.images.read import SourceImage
 from clpipe.images.tags import Tags, from_attributes, orientation_of, upright
 from clpipe.images.write import JPEG_MAX_SIDE, write_display, write_exr, write_npy
 from clpipe.inputs.carry import CarriedLayers
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
 from clpipe.inputs.kept import attributes_of
 from clpipe.outputs.carried import write_carried
 from clpipe.outputs.folder import RESUMABLE, write_problem

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any
 
 from clpipe.base.errors import ClpipeError, RequestError
 from clpipe.base.files import write_new
@@ -130,9 +130,6 @@ class Renderer(AbstractContextManager["Renderer"]):
                 f"--blender: {program} cannot be started: {error.strerror}; give the path of "
                 "Blender's program"
             ) from None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.stop()

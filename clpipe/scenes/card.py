@@ -115,21 +115,16 @@ def _sheet(folder: Path, members: Sequence[Member]) -> bytes | None:
     complete = {view: row for view, row in by_view.items() if list(row) == columns}
     step = -(-len(complete) // MAX_ROWS) or 1
     rows = list(complete.items())[::step]
-    pictures = [
-        [folder / member.files[PICTURE] for member in row.values()]
-        + [folder / path for path in _truths(next(iter(row.values())))]
-        for _, row in rows
-    ]
-    if not rows or not all(path.suffix in SHEET_SUFFIXES for row in pictures for path in row):
+    if not rows:
         return None
-    titles = [column or PICTURE for column in columns] + list(_truths(rows[0][1][columns[0]], True))
+    shown = [(series, PICTURE) for series in columns]
+    if all(TRUTH in row[columns[0]].files for _, row in rows):
+        shown.append((columns[0], TRUTH))
+    pictures = [[folder / row[series].files[kind] for series, kind in shown] for _, row in rows]
+    if not all(path.suffix in SHEET_SUFFIXES for row in pictures for path in row):
+        return None
+    titles = [series if series and kind == PICTURE else kind for series, kind in shown]
     return contact_sheet(pictures, [view for view, _ in rows], titles)
-
-
-def _truths(member: Member, names: bool = False) -> list[str]:
-    """Return the path or name of a view's picture without noise, in a list that may be empty."""
-    found = [(name, path) for name, path in member.files.items() if name == TRUTH]
-    return [name if names else path for name, path in found]
 
 
 def _readme(

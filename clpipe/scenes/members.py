@@ -108,10 +108,7 @@ def members_of(folder: Path, renders: str) -> list[Member]:
 
 
 def _member(
-    folder: Path,
-    renders: str,
-    name: str,
-    renditions: Mapping[str, tuple[Path, Mapping[str, Any]]],
+    folder: Path, renders: str, name: str, renditions: Mapping[str, tuple[Path, Mapping[str, Any]]]
 ) -> Member | None:
     """Return the member of a view, or None if its picture is missing; see :func:`members_of`.
 

@@ -13,14 +13,14 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
 from clpipe.base.reading import check_exists
 from clpipe.images.passes import find_layers, layer_kind
-from clpipe.inputs.find import Job
+from clpipe.inputs.jobs import Job
+from clpipe.outputs.camera_formats import CAMERAS, TRANSFORMS
 from clpipe.scenes.blender import Renderer, RenderError, Rendering, Scene
 from clpipe.scenes.leaves import dead_leaves, read_palette, write_leaves
 from clpipe.scenes.record import read_record, write_record
 from clpipe.scenes.view_request import dependencies
 
 RENDERS, UNIT, NOTE = "renders", "Unit of depth and poses", "Which views"
-CAMERAS = "cameras.json"
 FLOW = "Vector"  # name of Blender's flow layer, for frames
 
 
@@ -101,9 +101,7 @@ def from_folder(folder: Path, output: Path, poses: Path | None) -> Source:
         raise RequestError(f"{folder}: this is neither a .blend nor a folder of renders; give one")
     origin = {"renders": folder.resolve().name}
     read_record(output, origin)
-    layers_of_file = [
-        path for name in (CAMERAS, "transforms.json") if (path := folder / name).is_file()
-    ]
+    layers_of_file = [path for name in (CAMERAS, TRANSFORMS) if (path := folder / name).is_file()]
     write_record(output, origin, {})
     about = {"Renders": f"`{folder.resolve().name}`"}
     return Source(

@@ -2,13 +2,12 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 from clpipe.analysis.noise_models.model import Law, Levels, SensorModel
 from clpipe.base.errors import ImageError
 from clpipe.images.raw import read_exif, read_raw_info
 
-NOISE_PROFILE = "Tag 0xC761"  # exifread's name of the tag
+NOISE_PROFILE = 51041  # tag
 
 
 def read_dng(path: Path) -> SensorModel:
@@ -19,14 +18,12 @@ def read_dng(path: Path) -> SensorModel:
             or levels.
     """
     facts, exif = read_raw_info(path), read_exif(path)
-    tags = (tag for name, tag in exif.tags.items() if name.endswith(NOISE_PROFILE))
-    tag = next(tags, None)
-    if tag is None:
+    values = [each for each in exif.values(NOISE_PROFILE) if isinstance(each, float)]
+    if not values:
         raise ImageError(
             f"{path}: this DNG has no NoiseProfile (tag 51041); give a DNG from an Android "
             "phone, Adobe's converter or clpipe"
         )
-    values = _numbers(tag)
     if len(values) not in (2, 6):
         raise ImageError(
             f"{path}: its NoiseProfile has {len(values)} numbers; expected 2 (a and b for all "
@@ -59,11 +56,3 @@ def read_dng(path: Path) -> SensorModel:
         xyz_to_camera=own or facts.xyz_to_camera,
         matrix_source="the DNG's ColorMatrix for D65" if own else "LibRaw's for this camera",
     )
-
-
-def _numbers(tag: Any) -> list[float]:
-    """Return the values of a tag of doubles, which exifread stores as tuples of one."""
-    try:
-        return [float(v[0] if isinstance(v, tuple) else v) for v in tag.values]
-    except (AttributeError, IndexError, TypeError, ValueError, ZeroDivisionError):
-        return []
