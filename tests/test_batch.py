@@ -744,7 +744,9 @@ class Panic(BaseException):
 # Where an image is decoded, developed and encoded.
 INSIDE = {
     "decode": (ImageLoader, "read"),
+    "order": (OutputWriter, "results"),
     "device": (Runner, "work"),
+    "finish": (ImageWorker, "finish"),
     "encode": (OutputWriter, "write"),
 }
 

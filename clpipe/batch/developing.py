@@ -143,7 +143,13 @@ class Developing:
         if error and (isinstance(error, DeviceError) or error is self._error):
             self._fail(error)
             files.set_exception(error)
-        elif result := self._worker.finish(state, recipe, development):
+            return
+        result = None
+        try:
+            result = self._worker.finish(state, recipe, development)
+        except BaseException as problem:  # an error of an image must not end the thread
+            state.fail(problem)
+        if result:
             self._encoders.submit(self._encode, state, recipe, result, development.device, files)
         else:
             files.set_result(None)

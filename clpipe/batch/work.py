@@ -128,7 +128,7 @@ class ImageWorker(JobLoader):
             )
             key = recipe.noise_key
             return recipe, Frame(recipe.chain, source.pixels, key, keep, encode, final, options)
-        except Exception as error:  # an error of an image must not end the thread
+        except BaseException as error:  # an error of an image must not end the thread
             state.fail(error)
             return None
 
