@@ -92,7 +92,7 @@ def offset_of_roots(context: Context) -> float:
     up the noise of luma, which appears as dots on saturated surfaces.
 
     >>> from clpipe.camera.profile import load_camera
-    >>> round(offset_of_roots(Context(load_camera("sony-a7r2"), 25600)), 4)
+    >>> float(offset_of_roots(Context(load_camera("sony-a7r2"), 25600)).round(4))
     0.0134
     """
     return 0.003 + 2 * np.sqrt(max(colour.at(0) for colour in noise_of_colours(context)))
