@@ -12,18 +12,15 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
-from clpipe.batch import job_state, replay, threads
-from clpipe.batch.job_state import JobState
-from clpipe.batch.memory_budget import MemoryBudget, host_bytes
+from clpipe.batch import replay
+from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import DONE, Outcome, Span
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
@@ -179,46 +176,6 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
         pytest.skip("needs PoCL, which makes two devices of one CPU")
     assert process.returncode == 0, stderr
     assert contents("out") == contents("whole")
-
-
-def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
-    renders(8)
-    (tmp_path / "out").mkdir()
-    start, both = ImageWorker.start, threading.Barrier(2)
-
-    def together(self, submitted):
-        both.wait(GUARD)  # for the other device's image
-        return start(self, submitted)
-
-    monkeypatch.setattr(ImageWorker, "start", together)
-    worker, jobs = worker_of(tmp_path)
-    batch = Batch(worker, [None, None])
-    outcomes = list(batch.run(jobs))
-    assert [o.status for o in outcomes] == ["done"] * 8
-    workers = [s.worker for o in outcomes for s in o.spans if s.step == "device"]
-    assert sorted(workers) == ["device 0"] * 4 + ["device 1"] * 4
-
-
-@pytest.mark.slow
-def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
-    renders(30)
-    (tmp_path / "out").mkdir()
-    monkeypatch.setattr("clpipe.batch.threads.MAX_COMMIT", 2)
-    worker, jobs = worker_of(tmp_path)
-    batch = Batch(worker, [None], threads=2)
-    decode, decoded = ImageWorker.begin, []
-
-    def counted(self, job, *arguments):
-        decoded.append(job)
-        return decode(self, job, *arguments)
-
-    monkeypatch.setattr(ImageWorker, "begin", counted)
-    assert batch.in_flight == 4
-    for taken, _ in enumerate(batch.run(jobs), 1):
-        # Those in flight, two that are to be committed, two that are, and two outcomes.
-        least, most = taken + batch.in_flight, taken + batch.in_flight + 6
-        wait_until(lambda least=least: len(decoded) >= min(least, 30), f"{least} images")
-        assert len(decoded) <= most
 
 
 @pytest.mark.slow
@@ -785,31 +742,6 @@ def test_what_nobody_expected_fails_its_image_alone(
     assert "failed" not in statuses("out").values()
 
 
-def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
-    renders(30)
-    (tmp_path / "out").mkdir()
-    worker, jobs = worker_of(tmp_path)
-    for dies in (Panic, ValueError):
-        caught = []
-
-        def die(*_, dies=dies):
-            raise dies("a mistake of ours")
-
-        def run(batch, caught=caught):
-            try:
-                list(batch.run(jobs))
-            except Exception as error:
-                caught.append(str(error))
-
-        with monkeypatch.context() as patch:
-            patch.setattr(JobState, "outcome", die)  # an error in the scheduling of images
-            thread = threading.Thread(target=run, args=(Batch(worker, [None], 1),), daemon=True)
-            thread.start()
-            thread.join(GUARD)
-            assert not thread.is_alive()
-        assert len(caught) == 1 and "a mistake of ours" in caught[0]
-
-
 def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplog):
     renders(8)
     (tmp_path / "out").mkdir()
@@ -836,58 +768,6 @@ def test_what_a_device_leaves_another_does(renders, tmp_path, monkeypatch, caplo
         list(Batch(worker_of(tmp_path)[0], [None]).run(jobs))
 
 
-@pytest.mark.parametrize(("budget", "together"), [(1, 1), (2, 2), (100, 4)])
-def test_images_wait_for_memory(renders, tmp_path, monkeypatch, budget, together):
-    """Only as many images as fit are in memory at a time; the others wait."""
-    renders(12)
-    (tmp_path / "out").mkdir()
-    worker, jobs = worker_of(tmp_path)
-    inside, seen, lock = set(), [], threading.Lock()
-    read, encode = ImageLoader.read, ImageWorker.encode
-    barrier = threading.Barrier(together)
-
-    def reading(self, job):
-        with lock:
-            inside.add(job.key)
-            seen.append(len(inside))
-        barrier.wait(GUARD)
-        return read(self, job)
-
-    def encoding(self, task, *arguments):
-        written = encode(self, task, *arguments)
-        with lock:
-            inside.remove(task.job.key)
-        return written
-
-    monkeypatch.setattr(ImageLoader, "read", reading)
-    monkeypatch.setattr(ImageWorker, "encode", encoding)
-    large = worker.bytes_of(jobs[1], 1, in_numpy=True)
-    outcomes = list(Batch(worker, [None], threads=4, memory=budget * large).run(jobs))
-    assert [o.status for o in outcomes] == ["done"] * 12
-    assert together == 4 or max(seen) == together
-
-
-def test_waiting_for_memory_is_not_time_of_decoding(renders, tmp_path, monkeypatch):
-    renders(3)
-    (tmp_path / "out").mkdir()
-    worker, jobs = worker_of(tmp_path)
-    waited, enter = [0.0], MemoryBudget.acquire
-
-    def clock():
-        return time.perf_counter() + waited[0]
-
-    def slow(*arguments):
-        waited[0] += 1e6  # s
-        return enter(*arguments)
-
-    for module in (threads, job_state):
-        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock, time=time.time))
-    monkeypatch.setattr(MemoryBudget, "acquire", slow)
-    outcomes = list(Batch(worker, [None], threads=1).run(jobs))
-    assert waited == [3e6]
-    assert all(0 < o.seconds("decode") < 1e6 for o in outcomes)
-
-
 def test_what_images_take(tmp_path, write_exr):
     loader = ImageLoader(Request())
     chain = loader.chain
@@ -907,18 +787,3 @@ def test_what_images_take(tmp_path, write_exr):
     # What is refused for its size takes nothing, and its message is that of reading.
     few = ImageLoader(Request(max_pixels=199))
     assert few.claim(Job(tmp_path / "a.exr", "a")).reading == 0
-
-
-def test_only_images_that_were_loaded_release_memory(renders, tmp_path, monkeypatch):
-    renders(4)
-    (tmp_path / "out").mkdir()
-    leases, release = [], MemoryBudget.take_back
-    monkeypatch.setattr(
-        MemoryBudget, "take_back", lambda self, lease: (leases.append(lease), release(self, lease))
-    )
-    for done in (4, 1):
-        leases.clear()
-        worker, jobs = worker_of(tmp_path)
-        statuses = [outcome.status for outcome in Batch(worker, [None]).run(jobs)]
-        assert statuses.count("done") == len(set(leases)) == len(leases) == done
-        next((tmp_path / "out").glob("r002.*")).unlink()

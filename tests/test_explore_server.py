@@ -1,6 +1,5 @@
 """``clpipe explore``: the server's responses, and the page in a browser."""
 
-import asyncio
 import http.client
 import json
 import logging
@@ -23,7 +22,7 @@ from tests.held import GUARD
 pytest.importorskip("starlette", reason="needs Starlette, in the extra explore")
 
 from clpipe.explorer import timeout
-from clpipe.explorer.server import Server, json_response
+from clpipe.explorer.server import Server
 from clpipe.explorer.view import View
 from tests.test_explore import NOISY, explorer_of
 
@@ -177,27 +176,6 @@ def test_a_connection_that_asks_nothing_whole_is_not_held(served, monkeypatch):
         with suppress(ConnectionError):  # uvicorn closes connections on which nothing comes
             slow.sendall(head)
             until_closed(slow)
-
-
-def test_a_question_may_take_longer_to_answer_than_to_ask(explorer, monkeypatch):
-    call_later, limits, cancelled = asyncio.BaseEventLoop.call_later, [], []
-
-    def noted(loop, delay, *arguments, **options):
-        handle = call_later(loop, delay, *arguments, **options)
-        if delay == GUARD:
-            limits.append(handle)
-        return handle
-
-    def answering(self, question):
-        cancelled.extend(limit.cancelled() for limit in limits)
-        return json_response({})
-
-    monkeypatch.setattr(timeout, "REQUEST_TIMEOUT", GUARD)
-    monkeypatch.setattr(asyncio.BaseEventLoop, "call_later", noted)
-    monkeypatch.setattr(Server, "_start", answering)
-    with serving(explorer) as address:
-        assert answer(address, "start", {})[0] == 200
-    assert cancelled and all(cancelled)  # while the answer is being made, no limit is left
 
 
 def test_two_explorers_at_once(served, two_renders):

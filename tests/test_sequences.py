@@ -10,17 +10,14 @@ import OpenEXR
 import pytest
 
 import clpipe
-from clpipe.base.errors import DeviceFailedError, RequestError
+from clpipe.base.errors import RequestError
 from clpipe.base.memory import FreeMemory
-from clpipe.batch import memory_budget, metering, threads
-from clpipe.batch.memory_budget import MemoryBudget
+from clpipe.batch import memory_budget, threads
 from clpipe.camera.control import AutoIso, Control, ControlLoop
 from clpipe.chain.drawing import draw_values
 from clpipe.chain.draws import Drift
 from clpipe.chain.files import load_settings
 from clpipe.chain.limits import Limits
-from clpipe.engine.device import Device, open_devices
-from clpipe.engine.runner import Runner
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.manifest import read_manifest
@@ -246,22 +243,13 @@ def test_a_frame_that_cannot_be_read_fails_alone(frames, tmp_path):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """The keys of the images that were read, in order; each is checked to have memory."""
-    found, budgets, read = [], [], ImageLoader.read
-
-    def budget(*arguments):
-        budgets.append(MemoryBudget(*arguments))
-        return budgets[-1]
+    """The keys of the images that were read, in order."""
+    found, read = [], ImageLoader.read
 
     def reading(self, job):
-        taken = budgets[-1]._taken.values()
-        assert taken
-        assert sum(taken) <= budgets[-1]._size or len(taken) == 1
         found.append(job.key)
         return read(self, job)
 
-    monkeypatch.setattr(threads, "MemoryBudget", budget)
-    monkeypatch.setattr(metering, "MemoryBudget", budget)
     monkeypatch.setattr(ImageLoader, "read", reading)
     return found
 
@@ -288,20 +276,6 @@ def test_each_frame_is_decoded_once(frames, reads, tmp_path, monkeypatch, budget
     again = keys[:6] if has_state else []
     assert statuses.count("done") == (9 if has_state else 1)
     assert sorted(reads) == sorted([*keys, *again])
-
-
-def test_frames_are_metered_by_the_devices_of_the_run(frames, tmp_path, monkeypatch):
-    opened, init = [], Device.__init__
-
-    def counted(self, *arguments):
-        opened.append(self)
-        init(self, *arguments)
-
-    monkeypatch.setattr(Device, "__init__", counted)
-    assert {
-        o.status for o in clpipe.run(tmp_path / "frames", tmp_path / "out", sequence=True, **LOOPS)
-    } == {"done"}
-    assert len(opened) == len(open_devices())
 
 
 def test_a_frame_that_no_memory_suffices_for_fails_alone(
@@ -341,22 +315,11 @@ def black(tmp_path, write_exr, monkeypatch):
     write_exr("frames/a/4.exr", np.zeros((24, 32, 3)))
 
 
-def unmetered(tmp_path, write_exr, monkeypatch):
-    run_ = Runner.run
-
-    def failing(self, image, noise_key, options):
-        if noise_key.startswith("a/4.exr") and options.boxes:
-            raise DeviceFailedError("it failed")
-        return run_(self, image, noise_key, options)
-
-    monkeypatch.setattr(Runner, "run", failing)
-
-
 def unreadable(tmp_path, write_exr, monkeypatch):
     (tmp_path / "frames/a/4.exr").write_bytes(b"no picture")
 
 
-@pytest.mark.parametrize("fault", [black, unmetered, unreadable])
+@pytest.mark.parametrize("fault", [black, unreadable])
 def test_a_frame_that_cannot_be_metered_holds_the_loops(
     frames, tmp_path, write_exr, monkeypatch, fault
 ):
