@@ -15,7 +15,7 @@ from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
 from tests.conftest import written
-from tests.test_tiles import in_tiles
+from tests.test_cuts import in_tiles
 
 # The disc of a point that is infinitely far: 100^2 / (4 (2000 - 100)) mm = 131.6 px of 10 um.
 LENS = {"focal_length": 100.0, "f_number": 4.0, "focus_distance": 2.0, "pixel_pitch": 10.0}
@@ -61,10 +61,10 @@ def test_the_kernel_is_the_reference(device, scalar_device, size, blades):
         )
 
 
-def test_tiles_have_the_same_bits(device, monkeypatch):
+def test_tiles_have_the_same_bits(device):
     image, depth = scene(150, 203)
     runner, _held = runner_for(image, depth, device, max_radius=5)
-    assert in_tiles(runner, image, 70, 56, monkeypatch)[1] >= 6
+    assert in_tiles(runner, image, 70, 56)[1] >= 6
 
 
 @pytest.mark.parametrize("distance", [at_radius(2.5), at_radius(7.2), at_radius(-9.0), 2.0])

@@ -40,22 +40,6 @@ def runner(settings, device, **options):
     return Runner(make_chain(settings_from(settings)), device, **options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("settings", SETTINGS[1::2])
-@pytest.mark.parametrize("shape", [(67, 101), (1, 40)])
-def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
-    image = np.ascontiguousarray(still_life[200 : 200 + shape[0], 300 : 300 + shape[1]])
-    plain = runner(settings, device)
-    expected = plain.run(image, "k").encoded
-    steps = [step.name for step in plain.chain.steps]
-    keep = ["normalize", "demosaic"] if len(settings) > 2 else ["sensor_noise", "tone_curve"]
-    result = runner(settings, device, keep=keep).run(image, "k")
-    assert np.array_equal(result.encoded, expected)
-    everything = runner(settings, device, keep=steps, final=True).run(image, "k")
-    assert np.array_equal(everything.encoded, expected)
-    assert np.array_equal(everything.kept[steps[-1]], everything.final)
-
-
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_device_and_numpy_agree(device, still_life, settings):
     image = np.ascontiguousarray(still_life[100:301, 250:553])

@@ -11,7 +11,6 @@ from clpipe.base.errors import DeviceFailedError, ImageError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.device import Device
-from clpipe.engine.extents import Box
 from clpipe.engine.ir import Launch
 from clpipe.engine.ops import Frame
 from clpipe.engine.options import RunOptions
@@ -75,23 +74,6 @@ def test_devices_with_one_lane_or_their_own_memory_give_the_same_bits(device, ch
     waits = [runner.submit(each, "", RunOptions(state=state)) for each in frames]  # all in flight
     for wait, result in zip(waits, expected, strict=True):
         np.testing.assert_array_equal(wait().final, result.final)
-
-
-def test_bands_kept_images_and_patches_give_the_same_bits(device):
-    frames = [np.full((61, 83, 3), 0.2, np.float16)] * 3
-    chain = chain_of(LONG)
-    expected = results(Runner(chain, device, final=True), frames)[-1]
-    apart = results(Runner(chain, device, final=True, bands=False), frames)[-1]
-    np.testing.assert_array_equal(apart.final, expected.final)
-    kept = results(Runner(chain, device, (STAGE, "denoise"), final=True), frames)[-1]
-    np.testing.assert_array_equal(kept.final, expected.final)
-    until = Runner(make_chain(chain.settings, until=STAGE), device, encode=False, final=True)
-    np.testing.assert_array_equal(results(until, frames)[-1].final, kept.kept[STAGE])
-    boxes = [Box(3, 5, 19, 13), Box(40, 50, 56, 58)]
-    patches = results(Runner(chain, device, final=True), frames, boxes=boxes)[-1]
-    for patch, box in zip(patches.final, boxes, strict=True):
-        part = expected.final[box.top : box.bottom, box.left : box.right]
-        np.testing.assert_array_equal(patch, part)
 
 
 def test_single_images_and_first_frames_do_not_change(device):
