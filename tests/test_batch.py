@@ -58,15 +58,6 @@ def stamps(folder):
     return {name: (Path(folder) / name).stat().st_mtime_ns for name in written(Path(folder))}
 
 
-def test_a_second_run_makes_nothing(clpipe, renders):
-    clpipe("run", renders(), *RUN)
-    before = stamps("out")
-    result = clpipe("run", "in", *RUN)
-    assert stamps("out") == before
-    assert "6 of 6 images done (6 of them were there already), 0 failed" in result.stderr
-    assert set(statuses("out").values()) == {"skipped"}
-
-
 def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
     clpipe("run", renders(), *RUN)
     whole, before = contents("out"), stamps("out")
@@ -111,13 +102,6 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
     camera.write_text(re.sub("black_level = 512", "black_level = 500", camera.read_text()))
     clpipe("run", "in", *RUN, "--camera", "mine.toml")
     assert set(statuses("out").values()) == {"done"}
-
-
-def test_overwrite(clpipe, renders):
-    clpipe("run", renders(2), *RUN)
-    before = stamps("out")
-    clpipe("run", "in", *RUN, "--redo", "all")
-    assert all(before[name] != at for name, at in stamps("out").items())
 
 
 def test_frames_that_are_missing_are_made_alone(clpipe, renders):
@@ -485,23 +469,6 @@ def test_what_is_drawn_for_an_image_is_drawn_again_where_it_re_enters(clpipe, re
         assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("file,iso\nr000.exr,100\n", "there is no column 'path'"),
-        ("path,iso\nr000.exr,fast\n", "row 2: iso: found 'fast'"),
-        ("path,denoise.a\nr000.exr,1\n", "unknown parameter of denoise 'a'"),
-        ("path,name\nr000.exr,../up\n", "row 2: name: found '../up'"),
-        ("path\nr000.exr\nr000.exr\n", "row 3: this row would write the same outputs as row 2"),
-    ],
-)
-def test_a_wrong_manifest_writes_nothing(clpipe, renders, text, message):
-    renders(1)
-    Path("in/list.csv").write_text(text)
-    assert message in clpipe("run", "in/list.csv", *RUN, status=2).stderr
-    assert not Path("out").exists()
-
-
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/3", "1.0/3"])
 def test_a_wrong_shard(text):
     with pytest.raises(RequestError, match="expected I/N"):
@@ -593,15 +560,6 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert "no such file" in clpipe("replay", "no.json", "-o", "b", status=2).stderr
 
 
-@pytest.mark.parametrize("kept", [0, 20, 300])
-def test_a_sidecar_that_was_cut_off_is_none(clpipe, renders, kept):
-    clpipe("run", renders(1), *RUN)
-    whole, sidecar_ = contents("out"), Path("out/r000.json")
-    sidecar_.write_bytes(sidecar_.read_bytes()[:kept])
-    clpipe("run", "in", *RUN)
-    assert contents("out") == whole
-
-
 @pytest.mark.parametrize("format_", ["jpg", "exr", "npy", "dng"])  # of each way to mark a file
 def test_a_picture_of_another_hand_is_not_written_over(clpipe, renders, format_):
     run = ("run", renders(1), *RUN, "--device", "numpy", "--format", format_)
@@ -644,12 +602,6 @@ def test_what_a_trace_must_not_write_over(clpipe, renders):
         clpipe("run", "in", *RUN, "--trace", "trace.json")
 
 
-def test_an_output_or_memory_that_cannot_be(clpipe, renders):
-    renders(1)
-    assert "--output: found an empty name" in clpipe("run", "in", "-o", "", status=2).stderr
-    assert "--memory: too little" in clpipe("run", "in", *RUN, "--memory", "1K", status=2).stderr
-
-
 def test_a_sidecar_that_somebody_edited(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
@@ -660,15 +612,6 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders):
         stderr = clpipe("replay", "edited.json", "-o", "b", status=2).stderr
         assert "edited.json: it is damaged" in stderr, changed
     assert not Path("b").exists()
-
-
-@pytest.mark.slow
-def test_a_replay_says_that_the_bytes_are_the_same(clpipe, renders):
-    clpipe("run", renders(1), *RUN)
-    for _ in ("made", "there already"):
-        stderr = clpipe("replay", "out/r000.json", "-o", "b", "--memory", "1G").stderr
-        assert "b/r000.jpg: the same bytes" in stderr
-    assert clpipe("run", "out/r000.jpg", "-o", "c", "-c", "unprocess").exit_code == 0
 
 
 def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):

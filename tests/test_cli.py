@@ -142,6 +142,7 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
         (["--stages", "mosaic,quantize"], 2, "ends in DN, but jpg cannot store DN"),
         (["--device", "quantum"], 3, "unknown device 'quantum'"),
         (["--format", "bmp"], 2, "bmp"),
+        (["--webdataset", "0"], 2, "--webdataset"),
     ],
 )
 def test_a_wrong_request_writes_nothing(clpipe, small, tmp_path, arguments, status, message):
@@ -157,6 +158,9 @@ def test_inputs_that_cannot_be(clpipe, small, tmp_path):
     assert "no file matches" in clpipe("run", "*.nothing", "-o", "out", status=2).stderr
     result = clpipe("run", small, "-o", small.parent, "--format", "exr", status=2)
     assert "this input would be overwritten" in result.stderr
+    assert "--output: found an empty name" in clpipe("run", small, "-o", "", status=2).stderr
+    little = clpipe("run", small, "-o", "out", "--memory", "1K", status=2)
+    assert "--memory: too little" in little.stderr
 
 
 def test_a_kept_stage_never_overwrites_an_input_or_another_result(clpipe, write_exr, tmp_path):

@@ -101,14 +101,6 @@ def test_a_named_clip_is_one_sequence(clpipe, frames):
     assert "found b.mp4 for 2 sequences (a, b); use -o OUT --format mp4" in result.output
 
 
-def test_finished_clips_are_skipped(clpipe, frames):
-    clpipe("run", frames("in/a", "in/b"), *RUN)
-    before = stamps()
-    clpipe("run", "in", *RUN)
-    assert stamps() == before
-    assert set(statuses(OUT).values()) == {"skipped"}
-
-
 @pytest.mark.parametrize("change", [("--seed", 1), ("--fps", 25)])
 def test_a_changed_request_makes_clips_again(clpipe, frames, change):
     clpipe("run", frames(), *RUN)
@@ -116,25 +108,6 @@ def test_a_changed_request_makes_clips_again(clpipe, frames, change):
     clpipe("run", "in", *RUN, *change)
     assert (OUT / "cam0.mkv").read_bytes() != before
     assert set(statuses(OUT).values()) == {"done"}
-
-
-def test_one_changed_frame_makes_its_clip_again(clpipe, frames, write_exr):
-    clpipe("run", frames("in/a", "in/b"), *RUN)
-    before = stamps()
-    write_exr("in/b/f3.exr", np.full((16, 24, 3), 0.2, np.float32))
-    clpipe("run", "in", *RUN)
-    changed = {name for name, stamp in stamps().items() if stamp != before[name]}
-    assert changed == {"b.mkv", "b.mkv.jsonl"}
-    assert list(statuses(OUT).values()).count("skipped") == 5
-    assert len(list(read_video(OUT / "b.mkv"))) == 5
-
-
-def test_a_damaged_clip_is_made_again(clpipe, frames):
-    clpipe("run", frames(), *RUN)
-    whole = (OUT / "cam0.mkv").read_bytes()
-    (OUT / "cam0.mkv").write_bytes(whole[:-9])
-    clpipe("run", "in", *RUN)
-    assert (OUT / "cam0.mkv").read_bytes() == whole
 
 
 def test_a_failed_frame_fails_its_sequence_only(clpipe, frames, caplog):
@@ -225,20 +198,6 @@ def test_new_clips_replace_decoded_frames(clpipe, frames):
     clpipe("run", frames(), *options, "--crf", 40, "--decoded")
     clpipe("run", "in", *options, "--crf", 10)
     assert not list(OUT.glob("*.decoded/*"))
-
-
-def test_files_of_other_programs_are_not_overwritten(clpipe, frames):
-    frames()
-    OUT.mkdir()
-    for name in ("cam0.mkv", "cam0.mkv.jsonl"):
-        (OUT / name).write_text("mine")
-        result = clpipe("run", "in", *RUN, status=2)
-        assert f"{name}: clpipe did not write this file" in result.output
-        assert (OUT / name).read_text() == "mine"
-        (OUT / name).unlink()
-    (OUT / "cam0.mkv").write_text("mine")
-    clpipe("run", "in", *RUN, "--redo", "all")
-    assert len(list(read_video(OUT / "cam0.mkv"))) == 5
 
 
 def test_shards_are_whole_sequences(clpipe, frames):
