@@ -153,7 +153,12 @@ CASES = {
 }
 SLOW = {
     "percentile": Case({"exposure": {"method": "auto", "rule": "percentile"}}),
-    "every source of noise": Case({"stages": [*stages_to_raw()], **sensor_parameters()}),
+    **{
+        f"every source of noise on {array}": Case(
+            on(array, [*stages_to_raw()], **sensor_parameters())
+        )
+        for array in ("GRBG", "x-trans", "RGBW")
+    },
     "estimated twice": Case(
         {
             "stages": ["mosaic", "white_balance", "demosaic", "mosaic", "white_balance"],
@@ -293,6 +298,18 @@ def own_memory(case: Case, whole: Result, device: Device, request: pytest.Fixtur
     same(whole, case.develop(Runner(case.made(), other, case.keep, final=True)))
 
 
+def numpy(case: Case, whole: Result, device: Device, request: pytest.FixtureRequest) -> None:
+    """NumPy computes the same, but for rounding."""
+    expected = case.develop(Runner(case.made(), None, case.keep, final=True))
+    for name, image in {"final": expected.final, **expected.kept}.items():
+        found = whole.final if name == "final" else whole.kept[name]
+        np.testing.assert_allclose(found, image, atol=1e-3, err_msg=name)
+    if expected.encoded is not None:
+        assert np.abs(whole.encoded.astype(int) - expected.encoded).max() <= 1
+    for step, values in expected.estimates.items():
+        assert whole.estimates[step] == pytest.approx(values, rel=1e-6)
+
+
 def kept(case: Case, whole: Result, device: Device, request: pytest.FixtureRequest) -> None:
     names = [step.name for step in case.made().steps]
     for keep in (names, names[1::3]):
@@ -338,7 +355,9 @@ WRONG = {
     for name in CASES
     if name.endswith(("binning", "x-trans, linear_mmse"))
 }
-WAYS: dict[str, Way] = {each.__name__: each for each in (tiles, patches, bands, own_memory, stack)}
+WAYS: dict[str, Way] = {
+    each.__name__: each for each in (tiles, patches, bands, own_memory, numpy, stack)
+}
 
 
 @pytest.mark.parametrize("way", [*WAYS, pytest.param("kept", marks=pytest.mark.slow)])

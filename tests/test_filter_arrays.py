@@ -16,7 +16,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
-from clpipe.engine.check import ARRAYS, compare, mosaic_parameters, sensor_parameters
+from clpipe.engine.check import ARRAYS, mosaic_parameters
 from clpipe.engine.runner import Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_raw, read_raw_info
@@ -153,25 +153,6 @@ def test_a_polarised_array_has_no_colours():
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
     gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
     np.testing.assert_allclose(gray.final, 0.2, atol=1e-6)
-
-
-def test_neighbours_outside_the_image_continue_the_array(device):
-    effects = sensor_parameters()
-    stages = {name: effects[name] for name in ("crosstalk", "blooming")}
-    chain = on("x-trans", stages=["mosaic", *stages], **stages)
-    assert compare(device, chain, [(37, 53), (1, 40)]).largest == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("array", "lanes"), [("x-trans", "many"), ("RGBW", "one")])
-def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array, lanes):
-    stages = settings_from({}).stages
-    until = {"stages": [*stages[: stages.index("quantize") + 1]], **sensor_parameters()}
-    chain = on(array, **until)
-    assert chain.steps[-1].name == "quantize"
-    on_device = scalar_device if lanes == "one" else device
-    found = compare(on_device, chain, [(37, 53), (1, 40), (40, 1)], half=True)
-    assert (found.largest, found.differing) == (0, 0)
 
 
 @pytest.mark.parametrize("array", [*NAMED, "RG/GB", "RGB/GBR/BRG"])

@@ -72,14 +72,6 @@ def test_noise_falls_from_frame_to_frame_in_each_sequence(frames):
         assert all(later < 1.03 * earlier for earlier, later in pairwise(noise))
 
 
-def test_numpy_and_the_device_agree(frames):
-    run(frames, "device", jobs=1)
-    run(frames, "numpy", device="numpy")
-    for name in pictures(frames / "numpy"):
-        one, two = (pixels(frames / out / name) for out in ("device", "numpy"))
-        assert np.abs(one - two).max() <= 1.5 / 255
-
-
 def test_a_missing_frame_recomputes_its_sequence_and_no_other(frames):
     run(frames, "out")
     first = pictures(frames / "out")
