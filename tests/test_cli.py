@@ -128,30 +128,6 @@ def test_a_folder_keeps_its_structure_and_a_bad_file_stops_nobody(clpipe, write_
     assert keys == ["a.exr", "sub/b.exr", "sub/deep/a.exr"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "message"),
-    [
-        (["--set", "denoise.grian=0"], 2, "did you mean 'grain'"),
-        (["--set", "denoise.luma_size=5"], 2, "'luma_size' is a parameter of bilateral and non"),
-        (["--set", "denoise.method=[1]"], 2, "denoise.method: unknown method"),
-        (["--set", "sensor_noise_2.a=1"], 2, "unknown stage in this chain 'sensor_noise_2'"),
-        (["--set", "denoise.grain=0", "--skip", "denoise"], 2, "in this chain 'denoise'"),
-        (["--set", "denoise.grain=true"], 2, "denoise.grain: found True"),
-        (["--device", ""], 3, "unknown device ''"),
-        (["--keep", "noise"], 2, "unknown stage in this chain 'noise'"),
-        (["--stages", "mosaic,quantize"], 2, "ends in DN, but jpg cannot store DN"),
-        (["--device", "quantum"], 3, "unknown device 'quantum'"),
-        (["--format", "bmp"], 2, "bmp"),
-        (["--webdataset", "0"], 2, "--webdataset"),
-    ],
-)
-def test_a_wrong_request_writes_nothing(clpipe, small, tmp_path, arguments, status, message):
-    result = clpipe("run", small, "-o", "out", *arguments, status=status)
-    assert message in result.stderr
-    assert "Traceback" not in result.stderr
-    assert not (tmp_path / "out").exists()
-
-
 def test_inputs_that_cannot_be(clpipe, small, tmp_path):
     (tmp_path / "empty").mkdir()
     assert "this folder has no images" in clpipe("run", "empty", "-o", "out", status=2).stderr

@@ -211,28 +211,6 @@ def test_shards_are_whole_sequences(clpipe, frames):
     assert len(whole) == 3
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"format": ["mp4", "jpg"]}, "found mp4, jpg, but a run writes either clips"),
-        ({"format": "mp4", "keep": "all"}, "keep: a clip contains only pictures"),
-        ({"format": "mp4", "patch": 8}, "patch: a clip contains only pictures"),
-        ({"format": "mp4", "webdataset": 8}, "webdataset: a clip contains only pictures"),
-        ({"format": "mp4", "truth": "mosaic"}, "truth: found mosaic, but a clip contains only"),
-        ({"format": "mp4", "codec": "ffv1"}, r"found a \.mp4 file for ffv1; expected \.mkv"),
-        ({"format": "mp4", "until": "mosaic"}, "until: the chain ends in mosaic, but a clip"),
-        ({"format": "mp4", "processes": 2}, "processes: a clip is encoded by one process"),
-        ({"format": "mp4", "bit_depth": 9}, "found h264 with 9 bits; expected h264 with 8 bits"),
-        ({"format": "mp4", "crf": 60}, "found crf 60; expected"),
-        ({"fps": 25}, "fps: this option needs a clip; use output='NAME.mp4', or format='mp4'"),
-        ({"decoded": True}, "decoded: this option needs a clip"),
-    ],
-)
-def test_options_that_contradict_each_other(frames, options, message):
-    with pytest.raises(RequestError, match=message):
-        api.run(frames(), "out", **options)
-
-
 def test_a_missing_library_is_noticed_early(frames, monkeypatch):
     monkeypatch.setattr("clpipe.base.extras.is_installed", lambda name: name != "av")
     with pytest.raises(RequestError, match=r"a clip needs av, .*\. Run: pip install av"):

@@ -198,36 +198,6 @@ def test_samples_of_a_batch_go_through_together_and_are_the_same(renders, launch
     assert found[1]["key"] == "r2.exr"
 
 
-def test_what_is_refused(renders):
-    for wrong, message in (
-        ({"isos": 3}, "isos"),
-        ({"keep": "demosiac"}, "demosaic"),
-        ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
-        ({"epoch": -1}, "found epoch -1"),
-        *(({"epochs": epochs}, "found epochs") for epochs in (0, -1, 1.5)),
-        ({"truth": "mosaic"}, "expected true or false, 'development', 'clean' or None"),
-        ({"keep": 5}, "found keep 5; expected a text, a list of texts or None"),
-        ({"start_at": 5}, "found start_at 5; expected a text or None"),
-        ({"threads": 0}, "found threads 0; expected 1 or more"),
-        ({"threads": "all"}, "found threads 'all'; expected a whole number or None"),
-        ({"transfer": "gamma"}, "found transfer 'gamma'; expected .*'srgb', 'linear'"),
-        ({"config": "none.toml"}, "none.toml: there is no such file"),
-        ({"config": 5}, "found config 5"),
-    ):
-        with pytest.raises(RequestError, match=message):
-            api.Dataset(renders, **wrong)
-    Path("m.csv").write_text("path\nin/none.exr\n")
-    for missing in ("none/", ["in/r0.exr", "in/none.exr"], "m.csv"):
-        with pytest.raises(RequestError, match=r"none.*: there is no such file or folder"):
-            api.Dataset(missing)
-    with pytest.raises(RequestError, match="found inputs 5; expected a text, a path or a"):
-        api.Dataset(5)
-    with pytest.raises(RequestError, match="no file matches"):
-        api.Dataset("in/*.png")
-    with pytest.raises(RequestError, match=r"have the same name r0\.exr"):
-        api.Dataset(["in/r0.exr", Path("in")])
-
-
 @pytest.mark.slow
 def test_kept_images_enter(clpipe, renders, dataset):
     clpipe("run", renders, "-o", "kept", "--iso", ISO, "--keep", "normalize")

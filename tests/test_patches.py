@@ -336,39 +336,6 @@ def test_layers_go_along(write_exr, tmp_path):
         api.Dataset(tmp_path / "a.exr", patch=api.Patches(16, augment=True), **given)[0]
 
 
-def test_rejected_patches(renders):
-    mosaic = {"until": "normalize"}
-    for wrong, message in (
-        ({"patch": 0}, "patch: found 0; expected a whole number of 1 or more"),
-        (
-            {"patch": 9, "raw": "packed"},
-            "found patch 9, but a packed raw has planes of half the size",
-        ),
-        ({"dtype": "int8"}, "unknown dtype 'int8'.*; allowed: float16, float32, uint16"),
-        ({"dtype": "half float"}, "unknown dtype 'half float'"),
-        ({"dtype": "uint16", **mosaic}, "dtype uint16: .* the chain ends in mosaic"),
-        (
-            {"dtype": "float16", "until": "quantize"},
-            "dtype float16: the chain ends in DN, which this type cannot hold exactly",
-        ),
-        ({"raw": "bayer"}, "found raw 'bayer'; expected .*'packed', 'mosaic'"),
-        ({"raw": "mosaic", "until": "exposure"}, "makes no raw in DN. Add the stage quantize"),
-        ({"raw": "mosaic", "dtype": "float32", "until": "quantize"}, "ends in DN, at quantize"),
-        ({"variance": True, "until": "exposure"}, "no stage of this chain adds noise"),
-        ({"cache": "much"}, "found cache 'much'; expected bytes, or a size such as 512M"),
-        ({"cache": -1}, "found cache -1"),
-    ):
-        with pytest.raises(RequestError, match=message):
-            api.Dataset(renders, device="numpy", **wrong)
-    for per_image in (0, "all"):
-        with pytest.raises(RequestError, match=f"per_image: found {per_image!r}; exp.* or 'grid'"):
-            api.Patches(8, per_image)
-    with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 pixels, .* 48x48; choose smal"):
-        list(api.Dataset(renders, device="numpy", patch=48, until="mosaic"))
-    with pytest.raises(ImageError, match=r"in/r1\.exr: .*57x41 .*even width and height"):
-        list(api.Dataset(renders, device="numpy", raw="packed", until="quantize"))
-
-
 @pytest.mark.parametrize("device", [None, "numpy"])
 def test_images_of_two_sizes_cannot_both_be_cut(renders, device):
     stages = ["exposure", "mosaic", "sensor_noise", "quantize", "normalize", "demosaic", "resize"]

@@ -307,27 +307,6 @@ def test_a_burst_has_each_truth_once(clpipe, write_exr):
         assert Path("o", name).read_bytes() == Path("one", name).read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--truth", "noise"), "is not one of 'development', 'clean', 'mosaic', 'variance'"),
-        ((*ALL[2:], "--until", "quantize", "--format", "exr"), "ends in DN, at quantize"),
-        ((*ALL, "--skip", "sensor_noise", "--skip", "row_noise"), "no ground truth to write"),
-        ((*ALL, "--start-at", "white_balance"), "no ground truth to write"),
-        (
-            (*ALL, "--stages", "mosaic,sensor_noise,mosaic_denoise,row_noise,demosaic,gamma"),
-            "mosaic_denoise (non_local_means) cannot compute the variance",
-        ),
-    ],
-)
-def test_a_truth_that_cannot_be_known_is_refused_before_anything_runs(
-    clpipe, write_exr, options, message
-):
-    result = clpipe("run", crop(write_exr), "-o", "o", *options, status=2)
-    assert message in " ".join(result.stderr.split())
-    assert not Path("o").exists()
-
-
 @pytest.mark.slow
 def test_noise_behind_the_mosaic_alone_has_no_clean_mosaic(clpipe, write_exr):
     noise = ("--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1")

@@ -388,21 +388,6 @@ def test_the_variance_of_patches(clpipe, renders):
             assert np.array_equal(np.load(f"v/r.000_{number:04}{ending}.npy"), sample[name])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--patch", 12, "--format", "dng"), "--patch: patches cannot be written as dng"),
-        (
-            ("--patch", 12, "--patches-per-image", "grit"),
-            "found 'grit'; expected a whole number from 1 to 9999, or grid",
-        ),
-        (("--augment",), "--augment: this option needs patches; add --patch SIZE"),
-    ],
-)
-def test_patches_that_cannot_be(clpipe, renders, options, message):
-    assert message in clpipe("run", renders(1), *RUN, *options, status=2).stderr
-
-
 def test_a_patch_larger_than_an_image_fails_that_image(clpipe, renders):
     result = clpipe("run", renders(2), *RUN, "--patch", 20, "--patches-per-image", "grid", status=1)
     assert "in/r.000.exr: the picture of this image has 40x17 pixels" in result.stderr

@@ -1,0 +1,179 @@
+"""Options with wrong values: the message names the key, the value and what is allowed."""
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clpipe as api
+from clpipe.base.errors import ImageError, RequestError
+
+# Options of ``clpipe run`` with a render, and parts of the message.
+COMMANDS = """
+--set denoise.grian=0 => did you mean 'grain'
+--set denoise.luma_size=5 => 'luma_size' is a parameter of bilateral and non
+--set denoise.method=[1] => denoise.method: unknown method
+--set sensor_noise_2.a=1 => unknown stage in this chain 'sensor_noise_2'
+--set denoise.grain=0 --skip denoise => in this chain 'denoise'
+--set denoise.grain=true => denoise.grain: found True
+--set denoise=2 => 'clpipe stages denoise' lists the parameters of this stage
+--device '' => unknown device ''
+--device quantum => unknown device 'quantum'
+--keep noise => unknown stage in this chain 'noise'
+--stages mosaic,quantize => ends in DN, but jpg cannot store DN
+--format bmp => bmp
+--format png --format png16 => png and png16 would both write NAME.png
+--format exr16 --until quantize => ends in DN, but exr16 cannot store DN
+--webdataset 0 => --webdataset
+--memory lots => clpipe: --memory: 'lots' is not a size
+--start-at denoize => unknown stage in this chain 'denoize' .. 'denoise'
+--until denoise_2 => unknown stage in this chain 'denoise_2'
+--start-at gamma --until mosaic => gamma comes after mosaic
+--until demosaic --keep gamma => unknown stage in this chain 'gamma'
+--until quantize --format jpg => the chain ends in DN, but jpg cannot store DN
+--set output.png_compression=10 => output.png_compression: found 10: .. than or eq
+--set output.jpeg_quality=101 => output.jpeg_quality: found 101: .. less than or
+--set output.jpeg_qualty=9 => unknown key of output 'jpeg_qualty' .. jpeg_quality
+--set output.jpeg_subsampling=4:1:1 => found '4:1:1': .. '4:4:4', '4:2:2' or
+--set output.date=today => output.date: found 'today': write the date like 2026
+--set render.focal_length=0 => render.focal_length: found 0: .. greater than 0
+--set render.exposure_time=fast => render.exposure_time: found 'fast': .. number
+--iso random => write iso = {log_uniform = [100, 6400]} in a configuration
+--iso 100,x => --iso: found '100,x'; expected numbers above 0
+--iso 100,-5 => expected numbers above 0 with commas between them, such as 100,800,3200
+--iso 100,1e2 => --iso: found '100,1e2', which lists 100 twice; list it once
+--iso 9 --set iso.choice=[9] => --set iso.choice=[9]: found --iso as well
+--iso 100,1e7 => found 1e+07, but camera sony-a7r2 goes from 100 to 25600
+--camera sony-a7r2 --camera ILCE-7RM2 => sony-a7r2 is listed twice
+--camera sony-a7r2 --camera nikon-f => nikon-f
+--patch 12 --format dng => --patch: patches cannot be written as dng
+--patch 8 --patches-per-image grit => found 'grit'; expected a whole number from 1 to 9999, or grid
+--augment => --augment: this option needs patches; add --patch SIZE
+--truth noise => is not one of 'development', 'clean', 'mosaic', 'variance'
+--truth mosaic --until quantize --format exr => ends in DN, at quantize
+--truth clean --truth mosaic --skip sensor_noise --skip row_noise => no ground truth to write
+--truth variance --start-at white_balance => no ground truth to write
+--truth variance --stages mosaic,sensor_noise,mosaic_denoise,row_noise => cannot compute the vari
+"""
+
+
+def rows(text):
+    return [pytest.param(*line.split(" => ")) for line in text.strip().splitlines()]
+
+
+@pytest.fixture
+def folder(write_exr, clpipe):
+    """A render of 13x9 pixels, and a manifest of another."""
+    write_exr("in/a.exr", np.full((9, 13, 3), 0.25))
+    Path("m.csv").write_text("path\nin/none.exr\n")
+
+
+@pytest.mark.parametrize(("options", "parts"), rows(COMMANDS))
+def test_a_wrong_command_writes_nothing(clpipe, folder, options, parts):
+    status = 3 if options.startswith("--device") else 2
+    stderr = clpipe("run", "in", "-o", "out", *shlex.split(options), status=status).stderr
+    for part in parts.split(" .. "):
+        assert part in " ".join(stderr.split())
+    assert "Traceback" not in stderr
+    if options.startswith(("--memory", "--patch", "--iso", "--set")):
+        assert "Invalid value" not in stderr
+    assert not Path("out").exists()
+
+
+SMALL = {"device": "numpy", "stages": ["exposure", "gamma"]}
+WHOLE = "expected a whole number from 1 to"
+RUNS = [
+    ({"iso": [100, 100]}, r"^iso: found \[100, 100\], which lists 100 twice"),
+    ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
+    ({"patch": 0}, "found patch 0; expected a whole number from 1"),
+    ({"patch": api.Patches(8, 10**4)}, "found patches_per_image 10000; expected a whole"),
+    ({"frames": 0}, f"found frames 0; {WHOLE} 100000"),
+    ({"frames": 10**9}, f"found frames 1000000000; {WHOLE} 100000"),
+    ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
+    ({"jobs": -1}, f"found jobs -1; {WHOLE} 1024"),
+    ({"webdataset": 0}, f"found webdataset 0; {WHOLE}"),
+    ({"max_pixels": 0}, f"found max_pixels 0; {WHOLE}"),
+    ({"memory": 0}, "^memory: '0' is not a size"),
+    ({"format": "gif"}, "unknown format 'gif'"),
+    ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
+    ({"bracket": [1, 1]}, r"^bracket: found \[1, 1\], which repeats \+1 EV"),
+    ({"bracket": [float("nan")]}, r"^bracket: found \[nan\]; expected EVs"),
+    ({"redo": "some"}, "found redo 'some'"),
+    ({"stages": ["normalize", "demosaic"], "layer": "a"}, "^layer: .* only for renders"),
+    ({"nosuch": 1}, "nosuch"),
+    ({"output": ""}, "output: found an empty path; name a directory"),
+    ({"output": "out.jpg"}, "the name of a picture"),
+    ({"format": ["mp4", "jpg"]}, "found mp4, jpg, but a run writes either clips"),
+    ({"format": "mp4", "keep": "all"}, "keep: a clip contains only pictures"),
+    ({"format": "mp4", "patch": 8}, "patch: a clip contains only pictures"),
+    ({"format": "mp4", "webdataset": 8}, "webdataset: a clip contains only pictures"),
+    ({"format": "mp4", "truth": "mosaic"}, "truth: found mosaic, but a clip contains only"),
+    ({"format": "mp4", "codec": "ffv1"}, r"found a \.mp4 file for ffv1; expected \.mkv"),
+    ({"format": "mp4", "stages": ["mosaic"]}, "the chain ends in mosaic, but a clip"),
+    ({"format": "mp4", "processes": 2}, "processes: a clip is encoded by one process"),
+    ({"format": "mp4", "bit_depth": 9}, "found h264 with 9 bits; expected h264 with 8 bits"),
+    ({"format": "mp4", "crf": 60}, "found crf 60; expected"),
+    ({"fps": 25}, "fps: this option needs a clip; use output='NAME.mp4', or format='mp4'"),
+    ({"decoded": True}, "decoded: this option needs a clip"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), RUNS)
+def test_a_wrong_run_is_rejected_at_once(folder, options, message):
+    start = {"start_at": "normalize"} if "layer" in options else {}
+    with pytest.raises(RequestError, match=message):
+        api.run(**{"inputs": "in", "output": "out", **SMALL, **start, **options})
+    assert not Path("out").exists()
+
+
+MOSAIC = {"until": "normalize"}
+SAMPLES = [
+    ({"isos": 3}, "isos"),
+    ({"keep": "demosiac"}, "demosaic"),
+    ({"truth": True, "skip": ["sensor_noise", "row_noise", "column_noise"]}, "adds noise"),
+    ({"epoch": -1}, "found epoch -1"),
+    *(({"epochs": epochs}, "found epochs") for epochs in (0, -1, 1.5)),
+    ({"truth": "mosaic"}, "expected true or false, 'development', 'clean' or None"),
+    ({"keep": 5}, "found keep 5; expected a text, a list of texts or None"),
+    ({"start_at": 5}, "found start_at 5; expected a text or None"),
+    ({"threads": 0}, "found threads 0; expected 1 or more"),
+    ({"threads": "all"}, "found threads 'all'; expected a whole number or None"),
+    ({"transfer": "gamma"}, "found transfer 'gamma'; expected .*'srgb', 'linear'"),
+    ({"config": "none.toml"}, "none.toml: there is no such file"),
+    ({"config": 5}, "found config 5"),
+    ({"patch": 0}, "patch: found 0; expected a whole number of 1 or more"),
+    ({"patch": 9, "raw": "packed"}, "found patch 9, but a packed raw has planes of half the size"),
+    ({"dtype": "int8"}, "unknown dtype 'int8'.*; allowed: float16, float32, uint16"),
+    ({"dtype": "half float"}, "unknown dtype 'half float'"),
+    ({"dtype": "uint16", **MOSAIC}, "dtype uint16: .* the chain ends in mosaic"),
+    ({"dtype": "float16", "until": "quantize"}, "dtype float16: the chain ends in DN, which this"),
+    ({"raw": "bayer"}, "found raw 'bayer'; expected .*'packed', 'mosaic'"),
+    ({"raw": "mosaic", "until": "exposure"}, "makes no raw in DN. Add the stage quantize"),
+    ({"raw": "mosaic", "dtype": "float32", "until": "quantize"}, "ends in DN, at quantize"),
+    ({"variance": True, "until": "exposure"}, "no stage of this chain adds noise"),
+    ({"cache": "much"}, "found cache 'much'; expected bytes, or a size such as 512M"),
+    ({"cache": -1}, "found cache -1"),
+    ({"inputs": "none/"}, "none.*: there is no such file or folder"),
+    ({"inputs": ["in/a.exr", "in/none.exr"]}, "none.*: there is no such file or folder"),
+    ({"inputs": "m.csv"}, "none.*: there is no such file or folder"),
+    ({"inputs": 5}, "found inputs 5; expected a text, a path or a"),
+    ({"inputs": "in/*.png"}, "no file matches"),
+    ({"inputs": ["in/a.exr", "in"]}, r"have the same name a\.exr"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), SAMPLES)
+def test_a_wrong_dataset_is_rejected_at_once(folder, options, message):
+    with pytest.raises(RequestError, match=message):
+        api.Dataset(**{"inputs": "in", "device": "numpy", **options})
+
+
+def test_patches_that_do_not_fit_are_rejected(folder):
+    for per_image in (0, "all"):
+        with pytest.raises(RequestError, match=f"per_image: found {per_image!r}; exp.* or 'grid'"):
+            api.Patches(8, per_image)
+    with pytest.raises(ImageError, match=r"in/a\.exr: .*13x9 pixels, .* 10x10; choose smal"):
+        list(api.Dataset("in", device="numpy", patch=10, until="mosaic"))
+    with pytest.raises(ImageError, match=r"in/a\.exr: .*13x9 .*even width and height"):
+        list(api.Dataset("in", device="numpy", raw="packed", until="quantize"))
