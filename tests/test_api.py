@@ -97,25 +97,6 @@ def test_what_a_user_may_write(render):
 
 
 @pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (
-            np.zeros((4, 4, 3), np.uint8),
-            "samples of type uint8, but the chain expects rgb as floats",
-        ),
-        ([[1.0]], "a list, but an array is expected"),
-        (np.zeros((4, 4), np.float32), "shape .4, 4., but .height, width, 3. is expected"),
-        (np.zeros((4, 4, 4), np.float32), "shape .4, 4, 4."),
-        (np.full((4, 4, 3), np.nan, np.float32), "48 samples that are NaN or infinite"),
-        (np.zeros((0, 4, 3), np.float32), "shape .0, 4, 3."),
-    ],
-)
-def test_an_image_that_is_none(camera, image, message):
-    with pytest.raises(clpipe.ImageError, match=message):
-        camera.process(image, "a")
-
-
-@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"denoise": {"strong": 1}}, "unknown parameter of denoise"),

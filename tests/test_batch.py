@@ -187,20 +187,6 @@ def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
     assert peaks[1] < peaks[0] + 16 * 2**20, peaks
 
 
-def test_a_fifth_of_the_files_is_damaged(clpipe, renders):
-    renders(10)
-    for i in (3, 7):
-        data = Path(f"in/r00{i}.exr").read_bytes()
-        Path(f"in/r00{i}.exr").write_bytes(data[: len(data) // 2])
-    result = clpipe("run", "in", *RUN, status=1)
-    for name in ("r003", "r007"):
-        assert result.stderr.count(f"in/{name}.exr: damaged") == 1
-    assert "8 of 10 images done, 2 failed" in result.stderr
-    right = {f"r00{i}.{e}" for i in range(10) if i not in (3, 7) for e in ("jpg", "json")}
-    assert set(written(Path("out"))) == right
-    assert list(statuses("out").values()).count("failed") == 2
-
-
 def test_the_log_says_what_was_done_when(clpipe, renders):
     clpipe("run", renders(2), *RUN)
     with open("out/run.jsonl", "ab") as file:

@@ -21,7 +21,6 @@ from clpipe.engine.cpu_target import Target
 from clpipe.engine.device import Device, open_devices
 from clpipe.engine.discovery import choose, choose_all, find_devices
 from clpipe.engine.hardware import Hardware, hardware_of
-from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.runtimes import lanes_for
 from tests.conftest import STILL_LIFE
@@ -245,14 +244,3 @@ def test_what_memory_held_before_does_not_matter(device, value):
             other = Runner(runner.chain, Device(info, memory))
             other.run(np.full((120, 240, 3), value, np.float16), "k")
             assert np.array_equal(other.run(image, "k").encoded, expected)
-
-
-def test_pixels_into_an_array_that_is_there(device):
-    runner = Runner(make_chain(settings_from({})), device)
-    image = np.full((20, 30, 3), 0.5, np.float16)
-    buffer = np.empty((20, 30, 3), np.uint8)
-    result = runner.run(image, "k", RunOptions(into=buffer))
-    assert result.encoded is buffer
-    assert np.array_equal(buffer, runner.run(image, "k").encoded)
-    with pytest.raises(ValueError, match=r"into has shape \(20, 30\)"):
-        runner.run(image, "k", RunOptions(into=buffer[..., 0]))

@@ -1,7 +1,5 @@
 """Denoising over time: a stage with state, on frames of a sequence."""
 
-from dataclasses import replace
-
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -49,31 +47,6 @@ def moving(size, count=3):
     for number, frame in enumerate(frames):
         frame[:, : size[1] // 2] = np.roll(frame[:, : size[1] // 2], number, axis=1)
     return [frame.astype(np.float32) for frame in frames]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_kernel_and_numpy_agree_on_every_frame(device, method):
-    chain = chain_of(method=method)
-    for size in ((1, 9), (2, 3), (37, 53)):
-        frames = moving(size)
-        on_device, in_numpy = (
-            results(Runner(chain, each, encode=False, final=True), frames)
-            for each in (device, None)
-        )
-        for one, two in zip(on_device, in_numpy, strict=True):
-            np.testing.assert_array_equal(one.final, two.final)
-    assert not np.array_equal(on_device[1].final, frames[1])
-
-
-@pytest.mark.parametrize("changes", [{"lanes": 1}, {"type": "GPU"}])
-def test_devices_with_one_lane_or_their_own_memory_give_the_same_bits(device, changes):
-    other = Device(replace(device.info, **changes))
-    chain, frames = chain_of(method="block_matching"), moving((37, 53), 5)
-    expected = results(Runner(chain, device, encode=False, final=True), frames)
-    runner, state = Runner(chain, other, encode=False, final=True), State()
-    waits = [runner.submit(each, "", RunOptions(state=state)) for each in frames]  # all in flight
-    for wait, result in zip(waits, expected, strict=True):
-        np.testing.assert_array_equal(wait().final, result.final)
 
 
 def test_single_images_and_first_frames_do_not_change(device):

@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 from collections import Counter
 from pathlib import Path
 from typing import ClassVar
@@ -197,18 +196,6 @@ def test_a_stall_without_end_is_an_error(bucket, monkeypatch):
     ):
         pass
     go.set()
-
-
-def test_large_files_have_more_time(bucket, monkeypatch):
-    monkeypatch.setattr(transfers, "TRY_SECONDS", 0.0)
-    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: time.sleep(0.3)))
-    size = Path("in/r0.exr").stat().st_size
-    monkeypatch.setattr(transfers, "MIN_SPEED", size / 60)
-    urls.upload(Path("in/r0.exr"), "faulty://b/x")
-    assert bucket.cat_file("/b/x") == Path("in/r0.exr").read_bytes()
-    with urls.fetched_files([urls.path_of("faulty://b/x")]) as (path,):
-        assert path.read_bytes() == Path("in/r0.exr").read_bytes()
-    assert not path.exists()
 
 
 @pytest.mark.parametrize("kind", ["stalls", "fails"])
