@@ -37,7 +37,7 @@ from clpipe.outputs import folder as output_folders
 from clpipe.outputs import record
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, contents, reseal, statuses, worker_of, written
+from tests.conftest import ROOT, contents, reseal, stamps, statuses, worker_of, written
 from tests.held import (
     GO,
     GUARD,
@@ -54,20 +54,16 @@ from tests.held import (
 RUN = ("-o", "out", "--iso", 3200)
 
 
-def stamps(folder):
-    return {name: (Path(folder) / name).stat().st_mtime_ns for name in written(Path(folder))}
-
-
 def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
     clpipe("run", renders(), *RUN)
-    whole, before = contents("out"), stamps("out")
+    whole, before = contents("out"), stamps()
     Path("out/r000.jpg").unlink()
     Path("out/r001.json").unlink()
     touched = Path("in/r002.exr")
     os.utime(touched, ns=(1, 1))  # the same bytes
     write_exr("in/r003.exr", np.full((24, 32, 3), 0.3, np.float32))
     clpipe("run", "in", *RUN)
-    made = {name for name, at in stamps("out").items() if before.get(name) != at}
+    made = {name for name, at in stamps().items() if before.get(name) != at}
     assert made == {f"r00{i}.{e}" for i in (0, 1, 3) for e in ("jpg", "json")}
     after = contents("out")
     assert {n for n in whole if whole[n] != after[n]} == {"r003.jpg", "r003.json"}
@@ -106,10 +102,10 @@ def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, re
 
 def test_frames_that_are_missing_are_made_alone(clpipe, renders):
     clpipe("run", renders(1), *RUN, "--frames", 3)
-    before, whole = stamps("out"), contents("out")
+    before, whole = stamps(), contents("out")
     Path("out/r000.frame1.jpg").unlink()
     clpipe("run", "in", *RUN, "--frames", 3)
-    made = {name for name, at in stamps("out").items() if before[name] != at}
+    made = {name for name, at in stamps().items() if before[name] != at}
     assert made == {"r000.frame1.jpg", "r000.frame1.json"}
     assert contents("out") == whole
 

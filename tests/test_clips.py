@@ -18,7 +18,7 @@ from clpipe.images.video import VideoOptions
 from clpipe.images.video_reading import read_video, video_info
 from clpipe.inputs.find import Job, Place
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import statuses, written
+from tests.conftest import stamps, statuses, written
 
 pytest.importorskip("av", reason="needs PyAV: pip install av")
 
@@ -42,10 +42,6 @@ def frames(write_exr, clpipe):
 
 def records(path):
     return [json.loads(line) for line in Path(path).read_text().splitlines()]
-
-
-def stamps():
-    return {name: (OUT / name).stat().st_mtime_ns for name in written(OUT) if "run." not in name}
 
 
 def test_a_clip_contains_the_pictures_in_temporal_order(clpipe, frames):

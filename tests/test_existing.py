@@ -14,7 +14,7 @@ from clpipe.chain.formats import ALL_FORMATS, extension_of
 from clpipe.images.whole import is_complete
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sidecar import output_entries
-from tests.conftest import contents, reseal, statuses
+from tests.conftest import contents, reseal, stamps, statuses
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
 MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
@@ -76,11 +76,6 @@ KINDS = {
     ),
     "clips": ((*NUMPY, "--format", "mkv", "--codec", "ffv1"), ["f.mkv", "f.mkv.jsonl"]),
 }
-
-
-def stamps():
-    names = [path for path in Path("out").rglob("*") if path.is_file() and path.name[:4] != "run."]
-    return {str(path.relative_to("out")): path.stat().st_mtime_ns for path in names}
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -151,17 +151,6 @@ def test_nothing_is_let_in_at_the_end():
         budget.acquire(60 * MIB)
 
 
-def test_small_images_are_not_slowed_by_measuring(clock):
-    count = []
-    budget = MemoryBudget(None, (), left=lambda: count.append(1) or FreeMemory(2**34, ""))
-    for _ in range(100):
-        budget.acquire(MIB)
-    assert len(count) == 1
-    clock[0] += 2 * memory_budget.MEASUREMENT_SECONDS
-    budget.acquire(MIB)
-    assert len(count) == 2
-
-
 def test_what_files_claim(write_exr, tmp_path):
     pixels = np.zeros((4, 10, 3), np.float32)
 

@@ -24,7 +24,7 @@ from clpipe.stage import Context, Kind, Method
 from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.exposure import Gain
 from clpipe.stages.row_noise import Gaussian as RowNoise
-from tests.conftest import STILL_LIFE, written
+from tests.conftest import STILL_LIFE, stamps, written
 from tests.dng import write_dng
 
 ALL = ("--truth", "development", "--truth", "mosaic", "--truth", "variance")
@@ -271,10 +271,6 @@ def test_the_clean_picture_is_written_kept_and_entered_again(clpipe, write_exr):
     assert {s["name"]: s["method"] for s in record["stages"]}["denoise"] == "biweight"
 
 
-def stamps():
-    return {name: Path("o", name).stat().st_mtime_ns for name in written(Path("o"))}
-
-
 def test_only_what_is_missing_is_made(clpipe, write_exr):
     run = ("run", crop(write_exr), "-o", "o", "--iso", 3200)
 
@@ -282,7 +278,7 @@ def test_only_what_is_missing_is_made(clpipe, write_exr):
         for name in written(Path("o")):
             os.utime(Path("o", name), (1, 1))
         clpipe(*run, *options)
-        return {name for name, at in stamps().items() if at != 10**9}
+        return {name for name, at in stamps("o").items() if at != 10**9}
 
     clpipe(*run)
     assert made("--truth", "mosaic") == {"a.truth_mosaic.exr", "a.truth_mosaic.json"}

@@ -21,7 +21,7 @@ from clpipe.batch.work import ImageWorker
 from clpipe.inputs.find import Job
 from clpipe.outputs import folder as output_folders
 from clpipe.outputs import writer
-from tests.conftest import statuses, written
+from tests.conftest import stamps, statuses, written
 from tests.held import GO, HOLDING, finish, interrupt, start, wait_until
 
 # A chain that other tests compile too.
@@ -62,10 +62,6 @@ def contents(folder):
     """Each file's bytes, by name, without the logs."""
     names = [n for n in written(Path(folder)) if not n.endswith(".jsonl")]
     return {name: (Path(folder) / name).read_bytes() for name in names}
-
-
-def stamps(folder):
-    return {name: (Path(folder) / name).stat().st_mtime_ns for name in contents(folder)}
 
 
 def test_what_readers_see(clpipe, renders):
@@ -179,9 +175,9 @@ def test_an_image_that_failed_is_left_out_and_tried_again(clpipe, renders):
     result = clpipe("run", "in", *RUN, status=1)
     assert "clpipe: in/r.002.exr: " in result.stderr and "9 of 10 images done" in result.stderr
     assert [s["__key__"] for s in samples("out/000000.tar")] == ["r_000", "r_001", "r_003"]
-    before = stamps("out")
+    before = stamps()
     clpipe("run", "in", *RUN, status=1)
-    assert stamps("out") == before
+    assert stamps() == before
     Path("in/r.002.exr").write_bytes(whole)
     os.utime("in/r.002.exr", ns=(stamp, stamp))
     clpipe("run", "in", *RUN)
@@ -191,11 +187,11 @@ def test_an_image_that_failed_is_left_out_and_tried_again(clpipe, renders):
 
 def test_tars_stay_where_every_image_fails(clpipe, renders):
     clpipe("run", renders(4), *RUN)
-    before = stamps("out")
+    before = stamps()
     for path in Path("in").iterdir():
         path.write_bytes(b"no image")
     clpipe("run", "in", *RUN, status=1)
-    assert stamps("out") == before
+    assert stamps() == before
     clpipe("run", "in", "-o", "none", *RUN[2:], status=1)
     assert contents("none") == {}
 
@@ -310,10 +306,10 @@ def test_stopped_and_gone_on_with(clpipe, renders):
     Path(GO).touch()
     assert "not begun" in finish(process)
     assert process.returncode == 130
-    before = stamps("out")
+    before = stamps()
     clpipe("run", "in", *RUN)
     assert len(contents("out")) == 15
-    assert all(stamps("out")[n] == at for n, at in before.items() if not n.startswith("."))
+    assert all(stamps()[n] == at for n, at in before.items() if not n.startswith("."))
     assert not [n for n in os.listdir("out") if n.startswith(".")]
 
 
@@ -327,10 +323,10 @@ def test_what_is_left_of_a_kill_while_packing_goes(clpipe, renders):
     folder.mkdir()
     with tarfile.open(OUT / "000000.tar") as tar:
         tar.extractall(folder, filter="data")
-    before = stamps("out")["000000.tar"]
+    before = stamps()["000000.tar"]
     clpipe("run", "in", *RUN)
     assert contents("out") == whole and sorted(os.listdir("out")) == ["000000.tar", "run.jsonl"]
-    assert stamps("out")["000000.tar"] == before
+    assert stamps()["000000.tar"] == before
 
 
 PATCHES = ("--patch", 12, "--augment", "--patches-per-image", 3, "--keep", "quantize")
