@@ -314,6 +314,17 @@ def clpipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cli
 
 
 @pytest.fixture
+def forget_stage_files(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Forget the stage files that were loaded, now and when it is called, until the test ends."""
+
+    def forget() -> None:
+        monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+
+    forget()
+    return forget
+
+
+@pytest.fixture
 def browser_page() -> Iterator[Any]:
     """A Chromium page whose console must stay empty.
 

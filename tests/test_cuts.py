@@ -15,7 +15,6 @@ from clpipe.base.errors import ImageError
 from clpipe.chain.chain import Chain
 from clpipe.chain.layers import layer_of_array, with_layers
 from clpipe.chain.making import make_chain
-from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
 from clpipe.engine.bindings import step_buffer
 from clpipe.engine.check import (
@@ -36,7 +35,6 @@ from clpipe.engine.tiles import LARGEST_TILE, buffer_sizes, halos_of, tiling_of
 from clpipe.stage import Kind, StageRole
 from clpipe.stages import DEFAULT_CHAIN
 from tests import methods
-from tests.test_contributing import block
 
 GRAY_WORLD = {"white_balance": {"method": "gray_world"}}
 WITH_STATE = [*DEFAULT_CHAIN]
@@ -401,19 +399,6 @@ def test_sizes_at_which_tiles_are_narrow_or_end_with_the_image(device):
         image = example(Kind.RGB, (height, width), half=True)
         counts.add(in_tiles(runner, image, columns, rows)[1])
     assert len(counts) > 6
-
-
-@pytest.mark.slow
-def test_a_stage_of_somebody_else_reads_places_in_the_image(device, tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
-    (tmp_path / "vignette.cl").write_text(block("c"))
-    (tmp_path / "vignette.py").write_text(block("python"))
-    stage = load_stage_file(tmp_path / "vignette.py")
-    chain = make_chain(settings_from({"stages": [stage.name]}))
-    image = example(Kind.RGB, (150, 203))
-    result, count = in_tiles(Runner(chain, device, final=True), image, 64, 48)
-    assert count >= 6
-    assert np.abs(result.final - Runner(chain, None, final=True).run(image, "k").final).max() < 1e-6
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])

@@ -22,9 +22,8 @@ PYTHON, OPENCL = block("python"), block("c")
 
 
 @pytest.fixture
-def clpipe(monkeypatch):
+def clpipe(forget_stage_files):
     """Run clpipe with no stage file loaded yet."""
-    monkeypatch.setattr(registry, "_from_files", {})
     return cli_output
 
 

@@ -113,8 +113,7 @@ def test_what_an_image_carries_stands_below_configuration_and_options():
     assert settings.parameters == {"exposure": {"ev": 1}, "gamma": {"method": "srgb"}}
 
 
-def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, forget_stage_files):
     file = tmp_path / "sent.py"
     file.write_text(STAGE_FILE.format(mark=str(tmp_path / "ran"), name="sent"))
     values = {"stages": ["exposure", "sent"], "sent": {"method": "nothing"}}
@@ -126,9 +125,9 @@ def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkey
     assert sent.chain.names == loader.chain.names
 
 
-def test_no_code_comes_from_a_sidecar(clpipe, write_exr, monkeypatch):
+def test_no_code_comes_from_a_sidecar(clpipe, write_exr, forget_stage_files):
     def forget():
-        monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+        forget_stage_files()
         Path("ran").unlink(missing_ok=True)
 
     forget()
