@@ -49,6 +49,20 @@ COMMANDS = """
 --camera sony-a7r2 --camera nikon-f => nikon-f
 --patch 12 --format dng => --patch: patches cannot be written as dng
 --patch 8 --patches-per-image grit => found 'grit'; expected a whole number from 1 to 9999, or grid
+--carry Depth:metres => --carry Depth:metres: unknown kind 'metres'
+--carry '' => expected a name such as Depth
+--carry a/b:label => expected a name such as Depth
+--carry Z --carry z => --carry z: the layer is named twice
+--carry Z=d.exr => must contain {name}, the name of the
+--carry Z:png= => must contain {name}
+--format dng --stages exposure,gamma => starts on rgb and has no quantize
+--format dng --until sensor_noise => the DN that quantize produces
+--format dng --until quantize --format jpg => ends in DN, but jpg cannot store DN
+--format dng --set quantize.white_level=1000.5 => white level of 1000.5, but DNG needs whole
+--format dng --start-at white_balance => starts on mosaic and has no quantize
+--set shutter.subframes=3 => in: shutter.subframes is 3, but this folder has 1 image
+--set shutter.subframes={choice=[2,4]} => shutter.subframes: found a random draw
+--set shutter.subframes=0 => shutter.subframes
 --augment => --augment: this option needs patches; add --patch SIZE
 --truth noise => is not one of 'development', 'clean', 'mosaic', 'variance'
 --truth mosaic --until quantize --format exr => ends in DN, at quantize
