@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 
 import clpipe as clpipe_api
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import ImageError
 from clpipe.chain.layers import layer_of_array, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
@@ -199,24 +199,6 @@ def test_depth_that_cannot_be_used(render, clpipe, depth, options, message):
         render("a_depth.exr", Z=depth)
     failed = clpipe("run", "a.exr", "-o", "o", *RUN, *THIN, *options, status=1)
     assert message in " ".join(failed.output.split())
-
-
-@pytest.mark.parametrize(
-    ("lens", "message"),
-    [
-        (
-            {"focus_distance": 0.04},
-            "must be more than the focal length of 50 mm. Check depth_scale",
-        ),
-        ({"blades": 3}, "5 to 9 blades"),
-        ({"sensor_width": 36.0, "pixel_pitch": 5.0}, "set either sensor_width or pixel_pitch"),
-        ({"camera": "sony-imx686"}, "sensor_width: this stage needs the pixel size"),
-    ],
-)
-def test_lenses_that_cannot_be(lens, message):
-    camera = {k: lens.pop(k) for k in ["camera"] if k in lens}
-    with pytest.raises(RequestError, match=message):
-        make_chain(settings_from({**camera, "defocus": {"method": "thin_lens", **lens}}))
 
 
 def test_in_python():

@@ -1,6 +1,7 @@
 """Options with wrong values: the message names the key, the value and what is allowed."""
 
 import shlex
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 
 import clpipe as api
 from clpipe.base.errors import ImageError, RequestError
+from clpipe.chain.making import make_chain
+from clpipe.chain.settings import settings_from
 
 # Options of ``clpipe run`` with a render, and parts of the message.
 COMMANDS = """
@@ -63,6 +66,16 @@ COMMANDS = """
 --set shutter.subframes=3 => in: shutter.subframes is 3, but this folder has 1 image
 --set shutter.subframes={choice=[2,4]} => shutter.subframes: found a random draw
 --set shutter.subframes=0 => shutter.subframes
+--bracket -2,x => --bracket: found '-2,x'; expected EVs, such as -2,0,2
+--bracket nan => expected EVs
+--bracket 1e-9,0 => expected EVs
+--bracket 1,1.0 => found '1,1.0', which repeats +1 EV; list each EV once
+--bracket 0,30 => +30 EV added to exposure.ev=0 is not allowed; exposure.ev: found 30
+--bracket 1 --skip exposure => this chain has no stage exposure:
+--truth iid --skip picture_noise => in the stage picture_noise, which this chain
+--truth iid --set picture_noise.method=iid_gaussian --set picture_noise.sigma=0.1 => already adds
+--truth iid --until normalize => which this chain does not have
+--truth iid --skip sensor_noise --skip row_noise => no stage of this chain adds noise
 --augment => --augment: this option needs patches; add --patch SIZE
 --truth noise => is not one of 'development', 'clean', 'mosaic', 'variance'
 --truth mosaic --until quantize --format exr => ends in DN, at quantize
@@ -93,6 +106,65 @@ def test_a_wrong_command_writes_nothing(clpipe, folder, options, parts):
     if options.startswith(("--memory", "--patch", "--iso", "--set")):
         assert "Invalid value" not in stderr
     assert not Path("out").exists()
+
+
+# Settings, as in a configuration, and parts of the message.
+SETTINGS = """
+demosiac.method="bilinear" => unknown stage 'demosiac' .. mean 'demosaic'
+demosaic.method="biliner" => demosaic.method: .. 'biliner' .. mean 'bilinear'
+sensor_noise.aa=1 => unknown parameter of sensor_noise .. 'aa' .. allowed: method, a, b
+sensor_noise.a=-1 => sensor_noise.a: found -1: .. greater than or equal to 0
+sensor_noise.a="much" => sensor_noise.a: found 'much': .. number
+sensor_noise.a=nan => sensor_noise.a: found nan: .. finite
+sensor_noise.chi=100.0 => sensor_noise: .. need both chi and theta; only chi is set
+sensor_noise={chi=1e3, theta=1.0, system_gain=2.0} => use only one of these parametrisations
+sensor_noise={a=1e-3, system_gain=2.0} => sensor_noise: set the noise in one parametrisation; a
+sensor_noise={chi=1e3, theta=1.0, p0=0.1} => sensor_noise: p0 = 0.1 makes b negative
+sensor_noise={method="poisson", a=0.0} => poisson needs the parameter a above 0
+sensor_noise.tukey_lambda=-0.5 => tukey_lambda
+mosaic.pattern="RGBG" => mosaic.pattern: found 'RGBG': .. 'RGGB', 'BGGR', 'GRBG'
+denoise={method="mean", luma_size=4} => denoise.luma_size: found 4: it must be odd, 1 to 15
+denoise={method="median", chroma_size=7} => denoise.chroma_size: found 7: it must be odd, 1 to 5
+mosaic_denoise.size=17 => mosaic_denoise.size: found 17: it must be odd, 1 to 15
+stages=["mosaic", "nosie"] => unknown stage 'nosie'
+skip=["nosie"] => unknown stage 'nosie'
+stages="mosaic" => stages: found 'mosaic', but expected a list
+stages=[] => no stage is left to run
+stages=["exposure", "demosaic"] => demosaic reads mosaic, but exposure gives rgb; list mosaic
+stages=["demosaic"] => demosaic reads mosaic, but the input gives rgb
+skip=["normalize"] => white_balance reads mosaic, but quantize gives raw .. normalize
+skip=["quantize"] => normalize reads raw, but black_level_error gives mosaic .. quantize
+iso="high" => iso: found 'high', but expected a number
+isoo=3 => unknown key 'isoo' .. mean 'iso'
+iso=50 => iso: found 50, but camera sony-a7r2 goes from 100 to 25600
+camera="sony-a7r9" => unknown camera 'sony-a7r9': .. (most similar: sony-a7r)
+camera="nowhere.toml" => nowhere.toml: there is no such file
+color_matrix={method="given", matrix=[[1,0,0], [0,1,0], [1,1,0]]} => matrix: found .. is singular
+color_matrix={method="given", matrix=[[1,0,0], [0,1,0]]} => matrix: found .. three rows of three
+white_balance={method="white_patch", percentile=0} => percentile: found 0:
+white_balance={method="white_patch", percentile=101} => percentile: found 101
+quantize={black_level=600, white_level=500} => white_level must be above
+quantize.white_level=500 => white_level must be above
+motion_blur.length=300.0 => motion_blur.length .. 200
+motion_blur.rotation=1.0 => rotation needs a focal length; set fx
+motion_blur={method="perspective", rotation=1.0} => perspective needs a focal length; set fx
+motion_blur={rotation=9.0, fx=5000.0} => a streak of 792 px; at most
+motion_blur={rotation=1.0, fx=99.0, length=1.0} => set either length or rotation
+camera="sony-imx686"; optical_blur.f_number=2.0 => diffraction needs this parameter
+optical_blur.psf="none.exr" => none.exr: no such file
+defocus={method="thin_lens", focus_distance=0.04} => the focal length of 50 mm. Check depth_scale
+defocus={method="thin_lens", blades=3} => 5 to 9 blades
+defocus={method="thin_lens", sensor_width=36.0, pixel_pitch=5.0} => either sensor_width or pixel
+defocus.method="thin_lens"; camera="sony-imx686" => sensor_width: this stage needs the pixel size
+"""
+
+
+@pytest.mark.parametrize(("text", "parts"), rows(SETTINGS))
+def test_wrong_settings_are_rejected(text, parts):
+    with pytest.raises(RequestError) as caught:
+        make_chain(settings_from(tomllib.loads(text.replace("; ", "\n"))))
+    for part in parts.split(" .. "):
+        assert part in str(caught.value)
 
 
 SMALL = {"device": "numpy", "stages": ["exposure", "gamma"]}
