@@ -406,29 +406,21 @@ def test_a_key_stays_in_the_output_directory(tmp_path):
         clpipe.run(tmp_path / "a.csv", tmp_path / "out")
 
 
-def sequences_of(*names):
-    placed = in_sequences([Job(Path(name), name) for name in names])
-    found = {}
-    for job in placed:
-        found.setdefault(job.place.key, []).append((job.key, job.place.index))
-    return found
-
-
 def test_the_number_of_a_frame_is_not_that_of_a_camera_or_a_version():
     rig = [f"cam{camera}_f{frame}.exr" for camera in range(5) for frame in (1, 2, 3)]
-    found = sequences_of(*rig)
+    found = placed(*rig)
     assert len(found) == 5 and all(len(frames) == 3 for frames in found.values())
     versions = [f"shot_v{version}_{frame}.exr" for version in (1, 2, 10, 11) for frame in (1, 2)]
-    assert [len(frames) for frames in sequences_of(*versions).values()] == [2] * 4
+    assert [len(frames) for frames in placed(*versions).values()] == [2] * 4
     first = [f"frame_{frame:04}_cam{camera}.exr" for frame in (1, 2, 3) for camera in range(5)]
-    assert [len(frames) for frames in sequences_of(*first).values()] == [3] * 5
+    assert [len(frames) for frames in placed(*first).values()] == [3] * 5
     padded = [f"left{eye}.{frame:04}.exr" for eye in (0, 1) for frame in (9, 10)]
-    assert [len(frames) for frames in sequences_of(*padded).values()] == [2] * 2
+    assert [len(frames) for frames in placed(*padded).values()] == [2] * 2
 
 
 def test_numbers_of_frames_have_decimals():
     names = [f"f.{number}.exr" for number in ("1.25", "1.5", "1.75", "2.0")]
-    [frames] = sequences_of(*names).values()
+    [frames] = placed(*names).values()
     assert frames == list(zip(names, range(4), strict=True))
 
 
@@ -443,7 +435,7 @@ def test_numbers_of_frames_have_decimals():
 def test_time_stamps_are_times(stamps):
     """Intervals of 36 and 32 ms, whose mean is the unit."""
     names = [f"{stamp}.exr" for stamp in stamps]
-    [frames] = sequences_of(*names[::-1]).values()
+    [frames] = placed(*names[::-1]).values()
     assert [name for name, _ in frames] == names
     assert [place for _, place in frames] == pytest.approx([0, 36 / 34, 2], abs=2e-3)
 
@@ -464,7 +456,7 @@ def test_numbers_that_are_dates_are_no_time_stamps():
 
 
 def test_a_large_gap_is_no_time_stamp(caplog):
-    [frames] = sequences_of("f.1.exr", "f.2.exr", "f.3.exr", "f.1000.exr").values()
+    [frames] = placed("f.1.exr", "f.2.exr", "f.3.exr", "f.1000.exr").values()
     assert frames[-1] == ("f.1000.exr", 999)
     assert "996 of 1000 frames are missing: 4 to 999" in caplog.text
 
