@@ -6,7 +6,6 @@ import itertools
 import json
 import logging
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -87,17 +86,6 @@ def test_another_request_is_a_change(clpipe, renders, more):
     assert set(statuses("out").values()) == {"done"}
     clpipe("run", "in", *RUN[:2], *changed)
     assert set(statuses("out").values()) == {"skipped"}
-
-
-def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, renders):
-    camera = Path("mine.toml")
-    camera.write_text((ROOT / "clpipe/camera/profiles/sony-a7r2.toml").read_text())
-    clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
-    clpipe("run", "in", *RUN, "--camera", "mine.toml")
-    assert set(statuses("out").values()) == {"skipped"}
-    camera.write_text(re.sub("black_level = 512", "black_level = 500", camera.read_text()))
-    clpipe("run", "in", *RUN, "--camera", "mine.toml")
-    assert set(statuses("out").values()) == {"done"}
 
 
 def test_frames_that_are_missing_are_made_alone(clpipe, renders):

@@ -74,20 +74,6 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
         ),
         (('"px", gt=0)', '"px", gtt=0)'), r"vignette.py, line \d\d: TypeError: .*gtt; limits are"),
         (('kernel: ClassVar = "vignette"', 'kernel: ClassVar = "vig"'), "vig.cl does not exist"),
-    ],
-)
-def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
-    text = PYTHON.replace(*change)
-    assert text != PYTHON
-    stage_file.write_text(text)
-    output = clpipe("stages", "--stage-file", stage_file, status=2)
-    assert "Traceback" not in output
-    assert re.search(message, output), output
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
         (("self.focal_length**-2", "1 / 0"), r"vignette.py, line \d\d: ZeroDivisionError"),
         (
             ('"scale": scale', '"scale": "x"'),
@@ -97,7 +83,7 @@ def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
         (('Pass("vignette"', 'Pass("vinette"'), "a pass calls the function vinette, but"),
     ],
 )
-def test_a_stage_whose_parts_do_not_fit(clpipe, stage_file, change, message):
+def test_a_stage_file_with_a_mistake(clpipe, stage_file, change, message):
     text = PYTHON.replace(*change)
     assert text != PYTHON
     stage_file.write_text(text)
