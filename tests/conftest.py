@@ -63,6 +63,12 @@ def contents(folder: str | Path) -> dict[str, bytes]:
     return {name: (Path(folder) / name).read_bytes() for name in written(Path(folder))}
 
 
+def stamps(folder: str | Path = "out") -> dict[str, int]:
+    """Return when each file was modified, in ns, by its name, without what a run notes."""
+    names = [name for name in written(Path(folder)) if not name.startswith("run.")]
+    return {name: (Path(folder) / name).stat().st_mtime_ns for name in names}
+
+
 def statuses(folder: str | Path) -> dict[str, str]:
     """Return the log's outcome of each image in the last run."""
     lines = read_log(Path(folder) / "run.jsonl")
@@ -305,6 +311,17 @@ def clpipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cli
     """The command line in an empty folder, see :func:`run_cli`."""
     monkeypatch.chdir(tmp_path)
     return run_cli
+
+
+@pytest.fixture
+def forget_stage_files(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Forget the stage files that were loaded, now and when it is called, until the test ends."""
+
+    def forget() -> None:
+        monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+
+    forget()
+    return forget
 
 
 @pytest.fixture

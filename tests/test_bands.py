@@ -1,112 +1,23 @@
 """Launches in bands: the same bits as over whole images, in a few rows of memory."""
 
-from dataclasses import replace
-
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.bands import BAND, ring_bytes, schedule_of, strip_of, strips_of
-from clpipe.engine.check import example
-from clpipe.engine.extents import Box, Extent, whole_image
+from clpipe.engine.extents import Extent, whole_image
 from clpipe.engine.hardware import USUAL_CACHE, private_cache
-from clpipe.engine.ir import Cpu, Launch, Plan
-from clpipe.engine.options import RunOptions
+from clpipe.engine.ir import Cpu, Plan
 from clpipe.engine.plan import make_plan
-from clpipe.engine.runner import Runner
 from clpipe.engine.tiles import buffer_sizes
-from clpipe.stage import Kind
-from tests.test_tiles import same
+from tests.test_cuts import banded
 
 CPU = Cpu(cores=2, cache=1 << 19)
-WARPED = {
-    "distortion": {"method": "brown_conrady", "fx": 200.0, "k1": -0.1},
-    "resize": {"scale": 0.6},
-}
-CHAINS = {
-    "default": {},
-    "sums": {"white_balance": {"method": "gray_world"}},
-    "histogram": {"exposure": {"method": "auto"}},
-    "resampled": WARPED,
-    "paper": {"demosaic": {"method": "edge_directed_median"}, "denoise": {"method": "bilateral"}},
-    "means": {"demosaic": {"method": "menon2007"}, "denoise": {"method": "mean"}},
-    "blocks": {"denoise": {"method": "non_local_means"}},
-    "quad": {
-        "mosaic": {"method": "array", "array": "quad-RGGB"},
-        "demosaic": {"method": "linear_mmse"},
-    },
-}
 
 
 def plan_of(cpu: Cpu | None = CPU, **chain) -> Plan:
     return make_plan(make_chain(settings_from({"iso": 3200, **chain})), cpu=cpu)
-
-
-def banded(plan: Plan) -> list[Launch]:
-    return [x for x in plan.launches if isinstance(x, Launch) and x.bands]
-
-
-def narrow(device, monkeypatch, cores: int = 3, cache: int = 1) -> None:
-    """Let the device have strips as narrow as can be."""
-    monkeypatch.setattr("clpipe.engine.bands.SMALLEST", 256)
-    monkeypatch.setattr("clpipe.engine.bands.SMALLEST_CACHE", 1)
-    monkeypatch.setattr("clpipe.engine.discovery.private_cache", lambda: cache)
-    monkeypatch.setattr(device, "info", replace(device.info, compute_units=cores))
-
-
-@pytest.mark.parametrize("chain", CHAINS)
-def test_bands_give_the_same_bits(device, monkeypatch, chain):
-    narrow(device, monkeypatch)
-    chain = make_chain(settings_from({"iso": 3200, **CHAINS[chain]}))
-    one, two = (Runner(chain, device, final=True, bands=on) for on in (True, False))
-    for size in ((61, 203), (150, 64), (40, 41)):
-        image = example(Kind.RGB, size, half=True)
-        assert banded(one.plan_for(image)) and not banded(two.plan_for(image))
-        same(two.run(image, "k"), one.run(image, "k"))
-
-
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-@pytest.mark.parametrize("height", range(48, 52))
-def test_bands_give_the_same_bits_for_all_patterns(device, monkeypatch, pattern, height):
-    narrow(device, monkeypatch)
-    chain = make_chain(settings_from({"iso": 3200, "mosaic": {"pattern": pattern}}))
-    image = example(Kind.RGB, (height, 131))
-    one, two = (Runner(chain, device, bands=on).run(image, "k") for on in (True, False))
-    same(two, one)
-
-
-@pytest.mark.parametrize("size", [(1, 40), (40, 1), (3, 3), (5, 5), (6, 200), (11, 11)])
-def test_images_hardly_larger_than_a_border_run_launch_by_launch(device, size):
-    runner = Runner(make_chain(settings_from({})), device)
-    image = example(Kind.RGB, size)
-    plan = runner.plan_for(image)
-    assert plan.border == 2
-    assert bool(banded(plan)) == (min(size) > 5)
-    same(Runner(runner.chain, device, bands=False).run(image, "k"), runner.run(image, "k"))
-
-
-def test_tiles_patches_and_stacks_run_in_bands(device, monkeypatch):
-    narrow(device, monkeypatch, cache=1 << 16)
-    runner = Runner(make_chain(settings_from({"iso": 3200})), device)
-    image = example(Kind.RGB, (301, 203), half=True)
-    whole = Runner(runner.chain, device, bands=False).run(image, "k")
-    boxes = boxes_of(whole.image.shape)
-    patches = runner.run(image, "k", RunOptions(boxes=boxes))
-    for box, patch in zip(boxes, patches.image, strict=True):
-        assert np.array_equal(patch, whole.image[box.top : box.bottom, box.left : box.right])
-
-
-def boxes_of(shape):
-
-    height, width = shape[:2]
-    return [
-        Box(x, y, x + 40, y + 33)
-        for y in range(0, height - 33, 67)
-        for x in range(0, width - 40, 41)
-    ]
 
 
 def test_what_ends_a_run_of_bands():

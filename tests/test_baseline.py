@@ -125,18 +125,3 @@ def test_it_is_made_again_alone_the_same(clpipe, render, tmp_path):
     assert path.read_bytes() == made
     clpipe("replay", "out/view.ev-1.iid.json", "-o", "again", "--device", "numpy")
     assert (tmp_path / "again/view.ev-1.iid.png").read_bytes() == made
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--skip", "picture_noise"], "in the stage picture_noise, which this chain"),
-        (["--set", "picture_noise.method=iid_gaussian", "--set", "picture_noise.sigma=0.1"],
-         "picture_noise already adds noise"),
-        (["--until", "normalize"], "which this chain does not have"),
-        (["--skip", "sensor_noise", "--skip", "row_noise"], "no stage of this chain adds noise"),
-    ],
-)  # fmt: skip
-def test_what_is_refused(clpipe, render, options, message):
-    command = ("run", render, "-o", "out", *NUMPY, "--truth", "iid", *options)
-    assert message in clpipe(*command, status=2).stderr

@@ -6,24 +6,21 @@ import itertools
 import json
 import logging
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import threading
-import time
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from clpipe.base.errors import DeviceError, ImageError, OutputError, RequestError
-from clpipe.batch import job_state, replay, threads
+from clpipe.batch import replay
 from clpipe.batch.job_state import JobState
-from clpipe.batch.memory_budget import MemoryBudget, host_bytes
+from clpipe.batch.memory_budget import host_bytes
 from clpipe.batch.outcome import DONE, Outcome, Span
 from clpipe.batch.run_log import read_log
 from clpipe.batch.threads import Batch
@@ -41,7 +38,7 @@ from clpipe.outputs import folder as output_folders
 from clpipe.outputs import record
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, contents, reseal, statuses, worker_of, written
+from tests.conftest import ROOT, contents, reseal, stamps, statuses, worker_of, written
 from tests.held import (
     GO,
     GUARD,
@@ -58,29 +55,16 @@ from tests.held import (
 RUN = ("-o", "out", "--iso", 3200)
 
 
-def stamps(folder):
-    return {name: (Path(folder) / name).stat().st_mtime_ns for name in written(Path(folder))}
-
-
-def test_a_second_run_makes_nothing(clpipe, renders):
-    clpipe("run", renders(), *RUN)
-    before = stamps("out")
-    result = clpipe("run", "in", *RUN)
-    assert stamps("out") == before
-    assert "6 of 6 images done (6 of them were there already), 0 failed" in result.stderr
-    assert set(statuses("out").values()) == {"skipped"}
-
-
 def test_what_is_missing_or_changed_is_made_again(clpipe, renders, write_exr):
     clpipe("run", renders(), *RUN)
-    whole, before = contents("out"), stamps("out")
+    whole, before = contents("out"), stamps()
     Path("out/r000.jpg").unlink()
     Path("out/r001.json").unlink()
     touched = Path("in/r002.exr")
     os.utime(touched, ns=(1, 1))  # the same bytes
     write_exr("in/r003.exr", np.full((24, 32, 3), 0.3, np.float32))
     clpipe("run", "in", *RUN)
-    made = {name for name, at in stamps("out").items() if before.get(name) != at}
+    made = {name for name, at in stamps().items() if before.get(name) != at}
     assert made == {f"r00{i}.{e}" for i in (0, 1, 3) for e in ("jpg", "json")}
     after = contents("out")
     assert {n for n in whole if whole[n] != after[n]} == {"r003.jpg", "r003.json"}
@@ -106,30 +90,12 @@ def test_another_request_is_a_change(clpipe, renders, more):
     assert set(statuses("out").values()) == {"skipped"}
 
 
-def test_the_content_of_a_file_that_is_named_is_a_part_of_the_request(clpipe, renders):
-    camera = Path("mine.toml")
-    camera.write_text((ROOT / "clpipe/camera/profiles/sony-a7r2.toml").read_text())
-    clpipe("run", renders(2), *RUN, "--camera", "mine.toml")
-    clpipe("run", "in", *RUN, "--camera", "mine.toml")
-    assert set(statuses("out").values()) == {"skipped"}
-    camera.write_text(re.sub("black_level = 512", "black_level = 500", camera.read_text()))
-    clpipe("run", "in", *RUN, "--camera", "mine.toml")
-    assert set(statuses("out").values()) == {"done"}
-
-
-def test_overwrite(clpipe, renders):
-    clpipe("run", renders(2), *RUN)
-    before = stamps("out")
-    clpipe("run", "in", *RUN, "--redo", "all")
-    assert all(before[name] != at for name, at in stamps("out").items())
-
-
 def test_frames_that_are_missing_are_made_alone(clpipe, renders):
     clpipe("run", renders(1), *RUN, "--frames", 3)
-    before, whole = stamps("out"), contents("out")
+    before, whole = stamps(), contents("out")
     Path("out/r000.frame1.jpg").unlink()
     clpipe("run", "in", *RUN, "--frames", 3)
-    made = {name for name, at in stamps("out").items() if before[name] != at}
+    made = {name for name, at in stamps().items() if before[name] != at}
     assert made == {"r000.frame1.jpg", "r000.frame1.json"}
     assert contents("out") == whole
 
@@ -182,46 +148,6 @@ def test_several_devices_share_a_run(clpipe, renders, tmp_path):
     assert contents("out") == contents("whole")
 
 
-def test_devices_develop_at_the_same_time(renders, tmp_path, monkeypatch):
-    renders(8)
-    (tmp_path / "out").mkdir()
-    work, both = Runner.work, threading.Barrier(2)
-
-    def together(self, *arguments):
-        both.wait(GUARD)  # for the other device's image
-        return work(self, *arguments)
-
-    monkeypatch.setattr(Runner, "work", together)
-    worker, jobs = worker_of(tmp_path)
-    batch = Batch(worker, [None, None])
-    outcomes = list(batch.run(jobs))
-    assert [o.status for o in outcomes] == ["done"] * 8
-    workers = [s.worker for o in outcomes for s in o.spans if s.step == "device"]
-    assert sorted(workers) == ["device 0"] * 4 + ["device 1"] * 4
-
-
-@pytest.mark.slow
-def test_no_more_images_are_in_flight_than_there_are_places(renders, tmp_path, monkeypatch):
-    renders(30)
-    (tmp_path / "out").mkdir()
-    monkeypatch.setattr("clpipe.batch.threads.MAX_COMMIT", 2)
-    worker, jobs = worker_of(tmp_path)
-    batch = Batch(worker, [None], threads=2)
-    decode, decoded = ImageWorker.begin, []
-
-    def counted(self, job, *arguments):
-        decoded.append(job)
-        return decode(self, job, *arguments)
-
-    monkeypatch.setattr(ImageWorker, "begin", counted)
-    assert batch.in_flight == 4
-    for taken, _ in enumerate(batch.run(jobs), 1):
-        # Those in flight, two that are to be committed, two that are, and two outcomes.
-        least, most = taken + batch.in_flight, taken + batch.in_flight + 6
-        wait_until(lambda least=least: len(decoded) >= min(least, 30), f"{least} images")
-        assert len(decoded) <= most
-
-
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
     renders(1)
@@ -245,20 +171,6 @@ def test_memory_does_not_grow_with_the_number_of_images(renders, tmp_path):
         )
         peaks.append(int(done.stdout))
     assert peaks[1] < peaks[0] + 16 * 2**20, peaks
-
-
-def test_a_fifth_of_the_files_is_damaged(clpipe, renders):
-    renders(10)
-    for i in (3, 7):
-        data = Path(f"in/r00{i}.exr").read_bytes()
-        Path(f"in/r00{i}.exr").write_bytes(data[: len(data) // 2])
-    result = clpipe("run", "in", *RUN, status=1)
-    for name in ("r003", "r007"):
-        assert result.stderr.count(f"in/{name}.exr: damaged") == 1
-    assert "8 of 10 images done, 2 failed" in result.stderr
-    right = {f"r00{i}.{e}" for i in range(10) if i not in (3, 7) for e in ("jpg", "json")}
-    assert set(written(Path("out"))) == right
-    assert list(statuses("out").values()).count("failed") == 2
 
 
 def test_the_log_says_what_was_done_when(clpipe, renders):
@@ -529,23 +441,6 @@ def test_what_is_drawn_for_an_image_is_drawn_again_where_it_re_enters(clpipe, re
         assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("file,iso\nr000.exr,100\n", "there is no column 'path'"),
-        ("path,iso\nr000.exr,fast\n", "row 2: iso: found 'fast'"),
-        ("path,denoise.a\nr000.exr,1\n", "unknown parameter of denoise 'a'"),
-        ("path,name\nr000.exr,../up\n", "row 2: name: found '../up'"),
-        ("path\nr000.exr\nr000.exr\n", "row 3: this row would write the same outputs as row 2"),
-    ],
-)
-def test_a_wrong_manifest_writes_nothing(clpipe, renders, text, message):
-    renders(1)
-    Path("in/list.csv").write_text(text)
-    assert message in clpipe("run", "in/list.csv", *RUN, status=2).stderr
-    assert not Path("out").exists()
-
-
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "1/", "a/b", "1/0", "-1/3", "1.0/3"])
 def test_a_wrong_shard(text):
     with pytest.raises(RequestError, match="expected I/N"):
@@ -637,15 +532,6 @@ def test_a_sidecar_whose_picture_cannot_be_the_same(clpipe, renders, monkeypatch
     assert "no such file" in clpipe("replay", "no.json", "-o", "b", status=2).stderr
 
 
-@pytest.mark.parametrize("kept", [0, 20, 300])
-def test_a_sidecar_that_was_cut_off_is_none(clpipe, renders, kept):
-    clpipe("run", renders(1), *RUN)
-    whole, sidecar_ = contents("out"), Path("out/r000.json")
-    sidecar_.write_bytes(sidecar_.read_bytes()[:kept])
-    clpipe("run", "in", *RUN)
-    assert contents("out") == whole
-
-
 @pytest.mark.parametrize("format_", ["jpg", "exr", "npy", "dng"])  # of each way to mark a file
 def test_a_picture_of_another_hand_is_not_written_over(clpipe, renders, format_):
     run = ("run", renders(1), *RUN, "--device", "numpy", "--format", format_)
@@ -688,12 +574,6 @@ def test_what_a_trace_must_not_write_over(clpipe, renders):
         clpipe("run", "in", *RUN, "--trace", "trace.json")
 
 
-def test_an_output_or_memory_that_cannot_be(clpipe, renders):
-    renders(1)
-    assert "--output: found an empty name" in clpipe("run", "in", "-o", "", status=2).stderr
-    assert "--memory: too little" in clpipe("run", "in", *RUN, "--memory", "1K", status=2).stderr
-
-
 def test_a_sidecar_that_somebody_edited(clpipe, renders):
     clpipe("run", renders(1), *RUN)
     record = json.loads(Path("out/r000.json").read_text())
@@ -704,15 +584,6 @@ def test_a_sidecar_that_somebody_edited(clpipe, renders):
         stderr = clpipe("replay", "edited.json", "-o", "b", status=2).stderr
         assert "edited.json: it is damaged" in stderr, changed
     assert not Path("b").exists()
-
-
-@pytest.mark.slow
-def test_a_replay_says_that_the_bytes_are_the_same(clpipe, renders):
-    clpipe("run", renders(1), *RUN)
-    for _ in ("made", "there already"):
-        stderr = clpipe("replay", "out/r000.json", "-o", "b", "--memory", "1G").stderr
-        assert "b/r000.jpg: the same bytes" in stderr
-    assert clpipe("run", "out/r000.jpg", "-o", "c", "-c", "unprocess").exit_code == 0
 
 
 def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
@@ -840,58 +711,6 @@ def test_what_a_device_leaves_another_does(device, renders, tmp_path, caplog):
         list(Batch(worker_of(tmp_path)[0], [broken]).run(jobs))
 
 
-@pytest.mark.parametrize(("budget", "together"), [(1, 1), (2, 2), (100, 4)])
-def test_images_wait_for_memory(renders, tmp_path, monkeypatch, budget, together):
-    """Only as many images as fit are in memory at a time; the others wait."""
-    renders(12)
-    (tmp_path / "out").mkdir()
-    worker, jobs = worker_of(tmp_path)
-    inside, seen, lock = set(), [], threading.Lock()
-    read, encode = ImageLoader.read, ImageWorker.encode
-    barrier = threading.Barrier(together)
-
-    def reading(self, job):
-        with lock:
-            inside.add(job.key)
-            seen.append(len(inside))
-        barrier.wait(GUARD)
-        return read(self, job)
-
-    def encoding(self, task, *arguments):
-        written = encode(self, task, *arguments)
-        with lock:
-            inside.remove(task.job.key)
-        return written
-
-    monkeypatch.setattr(ImageLoader, "read", reading)
-    monkeypatch.setattr(ImageWorker, "encode", encoding)
-    large = worker.bytes_of(jobs[1], 1, in_numpy=True)
-    outcomes = list(Batch(worker, [None], threads=4, memory=budget * large).run(jobs))
-    assert [o.status for o in outcomes] == ["done"] * 12
-    assert together == 4 or max(seen) == together
-
-
-def test_waiting_for_memory_is_not_time_of_decoding(renders, tmp_path, monkeypatch):
-    renders(3)
-    (tmp_path / "out").mkdir()
-    worker, jobs = worker_of(tmp_path)
-    waited, enter = [0.0], MemoryBudget.acquire
-
-    def clock():
-        return time.perf_counter() + waited[0]
-
-    def slow(*arguments):
-        waited[0] += 1e6  # s
-        return enter(*arguments)
-
-    for module in (threads, job_state):
-        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock, time=time.time))
-    monkeypatch.setattr(MemoryBudget, "acquire", slow)
-    outcomes = list(Batch(worker, [None], threads=1).run(jobs))
-    assert waited == [3e6]
-    assert all(0 < o.seconds("decode") < 1e6 for o in outcomes)
-
-
 def test_what_images_take(tmp_path, write_exr):
     loader = ImageLoader(Request())
     chain = loader.chain
@@ -911,18 +730,3 @@ def test_what_images_take(tmp_path, write_exr):
     # What is refused for its size takes nothing, and its message is that of reading.
     few = ImageLoader(Request(max_pixels=199))
     assert few.claim(Job(tmp_path / "a.exr", "a")).reading == 0
-
-
-def test_only_images_that_were_loaded_release_memory(renders, tmp_path, monkeypatch):
-    renders(4)
-    (tmp_path / "out").mkdir()
-    leases, release = [], MemoryBudget.take_back
-    monkeypatch.setattr(
-        MemoryBudget, "take_back", lambda self, lease: (leases.append(lease), release(self, lease))
-    )
-    for done in (4, 1):
-        leases.clear()
-        worker, jobs = worker_of(tmp_path)
-        statuses = [outcome.status for outcome in Batch(worker, [None]).run(jobs)]
-        assert statuses.count("done") == len(set(leases)) == len(leases) == done
-        next((tmp_path / "out").glob("r002.*")).unlink()

@@ -352,22 +352,6 @@ def test_what_cannot_be_carried_fails_alone(clpipe, render, write_exr, options, 
         assert "1 of 2 images done" in done.output
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--carry", "Depth:metres"), "--carry Depth:metres: unknown kind 'metres'"),
-        (("--carry", ""), "expected a name such as Depth"),
-        (("--carry", "a/b:label"), "expected a name such as Depth"),
-        (("--carry", "Z", "--carry", "z"), "--carry z: the layer is named twice"),
-        (("--carry", "Z=d.exr"), "must contain {name}, the name of the"),
-        (("--carry", "Z:png="), "must contain {name}"),
-    ],
-)
-def test_what_cannot_be_asked_for(clpipe, render, options, message):
-    render()
-    assert message in clpipe(*RUN, "in", *options, status=2).output
-
-
 def test_names_that_say_what_they_belong_to():
     assert owner_of(Path("in/view00_IndexOB.exr")) == "in/view00"
     assert owner_of(Path("in/a.carried.exr")) == "in/a"

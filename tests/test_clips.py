@@ -18,7 +18,7 @@ from clpipe.images.video import VideoOptions
 from clpipe.images.video_reading import read_video, video_info
 from clpipe.inputs.find import Job, Place
 from clpipe.stages import DEFAULT_CHAIN
-from tests.conftest import statuses, written
+from tests.conftest import stamps, statuses, written
 
 pytest.importorskip("av", reason="needs PyAV: pip install av")
 
@@ -42,10 +42,6 @@ def frames(write_exr, clpipe):
 
 def records(path):
     return [json.loads(line) for line in Path(path).read_text().splitlines()]
-
-
-def stamps():
-    return {name: (OUT / name).stat().st_mtime_ns for name in written(OUT) if "run." not in name}
 
 
 def test_a_clip_contains_the_pictures_in_temporal_order(clpipe, frames):
@@ -101,14 +97,6 @@ def test_a_named_clip_is_one_sequence(clpipe, frames):
     assert "found b.mp4 for 2 sequences (a, b); use -o OUT --format mp4" in result.output
 
 
-def test_finished_clips_are_skipped(clpipe, frames):
-    clpipe("run", frames("in/a", "in/b"), *RUN)
-    before = stamps()
-    clpipe("run", "in", *RUN)
-    assert stamps() == before
-    assert set(statuses(OUT).values()) == {"skipped"}
-
-
 @pytest.mark.parametrize("change", [("--seed", 1), ("--fps", 25)])
 def test_a_changed_request_makes_clips_again(clpipe, frames, change):
     clpipe("run", frames(), *RUN)
@@ -116,25 +104,6 @@ def test_a_changed_request_makes_clips_again(clpipe, frames, change):
     clpipe("run", "in", *RUN, *change)
     assert (OUT / "cam0.mkv").read_bytes() != before
     assert set(statuses(OUT).values()) == {"done"}
-
-
-def test_one_changed_frame_makes_its_clip_again(clpipe, frames, write_exr):
-    clpipe("run", frames("in/a", "in/b"), *RUN)
-    before = stamps()
-    write_exr("in/b/f3.exr", np.full((16, 24, 3), 0.2, np.float32))
-    clpipe("run", "in", *RUN)
-    changed = {name for name, stamp in stamps().items() if stamp != before[name]}
-    assert changed == {"b.mkv", "b.mkv.jsonl"}
-    assert list(statuses(OUT).values()).count("skipped") == 5
-    assert len(list(read_video(OUT / "b.mkv"))) == 5
-
-
-def test_a_damaged_clip_is_made_again(clpipe, frames):
-    clpipe("run", frames(), *RUN)
-    whole = (OUT / "cam0.mkv").read_bytes()
-    (OUT / "cam0.mkv").write_bytes(whole[:-9])
-    clpipe("run", "in", *RUN)
-    assert (OUT / "cam0.mkv").read_bytes() == whole
 
 
 def test_a_failed_frame_fails_its_sequence_only(clpipe, frames, caplog):
@@ -227,20 +196,6 @@ def test_new_clips_replace_decoded_frames(clpipe, frames):
     assert not list(OUT.glob("*.decoded/*"))
 
 
-def test_files_of_other_programs_are_not_overwritten(clpipe, frames):
-    frames()
-    OUT.mkdir()
-    for name in ("cam0.mkv", "cam0.mkv.jsonl"):
-        (OUT / name).write_text("mine")
-        result = clpipe("run", "in", *RUN, status=2)
-        assert f"{name}: clpipe did not write this file" in result.output
-        assert (OUT / name).read_text() == "mine"
-        (OUT / name).unlink()
-    (OUT / "cam0.mkv").write_text("mine")
-    clpipe("run", "in", *RUN, "--redo", "all")
-    assert len(list(read_video(OUT / "cam0.mkv"))) == 5
-
-
 def test_shards_are_whole_sequences(clpipe, frames):
     frames("in/a", "in/b", "in/c")
     clpipe("run", "in", *RUN)
@@ -250,28 +205,6 @@ def test_shards_are_whole_sequences(clpipe, frames):
         clpipe("run", "in", *RUN, "--shard", part, "--jobs", 3)
     assert {path.name: path.read_bytes() for path in OUT.glob("*.mkv")} == whole
     assert len(whole) == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"format": ["mp4", "jpg"]}, "found mp4, jpg, but a run writes either clips"),
-        ({"format": "mp4", "keep": "all"}, "keep: a clip contains only pictures"),
-        ({"format": "mp4", "patch": 8}, "patch: a clip contains only pictures"),
-        ({"format": "mp4", "webdataset": 8}, "webdataset: a clip contains only pictures"),
-        ({"format": "mp4", "truth": "mosaic"}, "truth: found mosaic, but a clip contains only"),
-        ({"format": "mp4", "codec": "ffv1"}, r"found a \.mp4 file for ffv1; expected \.mkv"),
-        ({"format": "mp4", "until": "mosaic"}, "until: the chain ends in mosaic, but a clip"),
-        ({"format": "mp4", "processes": 2}, "processes: a clip is encoded by one process"),
-        ({"format": "mp4", "bit_depth": 9}, "found h264 with 9 bits; expected h264 with 8 bits"),
-        ({"format": "mp4", "crf": 60}, "found crf 60; expected"),
-        ({"fps": 25}, "fps: this option needs a clip; use output='NAME.mp4', or format='mp4'"),
-        ({"decoded": True}, "decoded: this option needs a clip"),
-    ],
-)
-def test_options_that_contradict_each_other(frames, options, message):
-    with pytest.raises(RequestError, match=message):
-        api.run(frames(), "out", **options)
 
 
 def test_a_missing_library_is_noticed_early(frames, monkeypatch):

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import socket
-import threading
 import time
 from contextlib import nullcontext
 from dataclasses import replace
@@ -17,7 +16,6 @@ import pytest
 from distributed import Client, LocalCluster, WorkerPlugin
 
 import clpipe as package
-from clpipe.base.errors import OutputError
 from clpipe.batch import dask_client as cluster
 from clpipe.batch import dask_worker, work
 from clpipe.batch.dask_worker import (
@@ -28,7 +26,6 @@ from clpipe.batch.dask_worker import (
     worker_environment,
 )
 from clpipe.batch.execution import ExecutionOptions
-from clpipe.batch.run_log import RunLog
 from clpipe.chain.request import ResolvedRequest
 from clpipe.commands.progress import Reporter
 from clpipe.engine.device import open_devices
@@ -36,7 +33,7 @@ from clpipe.engine.discovery import devices_of_process
 from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
 from tests.conftest import ROOT
-from tests.held import GUARD, wait_until
+from tests.held import GUARD
 
 IMAGES = 16
 
@@ -219,9 +216,12 @@ def test_a_wrong_request(clpipe, renders, address):
     ],
 )
 def test_workers_of_another_make(clpipe, renders, workers, address, name, value, message):
-    def pretend(**to):
+    def pretend(first=0, **to):
         real = dask_worker.real = getattr(dask_worker, "real", worker_environment)
-        dask_worker.worker_environment = lambda selector: replace(real(selector), **to)
+        calls = itertools.count()
+        dask_worker.worker_environment = lambda selector: replace(
+            real(selector), **(to if next(calls) >= first else {})
+        )
         package.__version__ = to.get("version", "0.1.0")
 
     worker = next(iter(workers.nthreads()))
@@ -229,52 +229,12 @@ def test_workers_of_another_make(clpipe, renders, workers, address, name, value,
     try:
         stderr = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
         assert message in stderr and worker in stderr
+        workers.run(pretend, first=1, **{name: value})  # after the probe of all workers
+        later = clpipe("run", "in", "-o", "out", "--dask", address, status=2).stderr
+        assert f"workers differ in their {name}" in later
         assert not contents("out")
     finally:
-        workers.run(pretend, workers=[worker])
-
-
-def hold(name, reached, go):
-    """On a worker: create a file at an image of this name, and wait there for another file."""
-    decode = work.ImageWorker.begin
-
-    def planted(this, job, *arguments):
-        if job.path.name == name:
-            Path(reached).touch()
-            while not Path(go).exists():
-                time.sleep(0.01)
-        return decode(this, job, *arguments)
-
-    work.ImageWorker.begin = planted
-
-
-def test_a_log_that_cannot_be_written_ends_the_run(
-    clpipe, renders, workers, address, monkeypatch, tmp_path
-):
-    """The run ends after other workers have finished their images."""
-    reached, go = tmp_path / "reached", tmp_path / "go"
-    workers.run(hold, "f04.exr", str(reached), str(go))  # the first one of the second chunk
-    halt = cluster.Cluster._halt
-
-    def full(self, outcome):
-        wait_until(reached.exists, "an image on the other worker")
-        raise OutputError("the disk is full")
-
-    def halted(self):
-        halt(self)
-        threading.Timer(0.3, go.touch).start()  # a run that did not wait would have ended by then
-
-    monkeypatch.setattr(RunLog, "add", full)
-    monkeypatch.setattr(cluster.Cluster, "_halt", halted)
-    try:
-        options = ("--device", "numpy", "--dask", address)  # compiles nothing
-        result = clpipe("run", "in", "-o", "out", *options, status=1)
-        assert "the disk is full" in result.stderr
-        made = contents("out")
-        assert Path("f04.json") in made
-        assert len(made) <= 2 * 8  # of two chunks, one on each worker
-    finally:
-        go.touch()
+        workers.run(pretend)
 
 
 def test_a_worker_that_comes_later_must_see_the_output(clpipe, renders, workers, address):
@@ -288,21 +248,6 @@ def test_a_worker_that_comes_later_must_see_the_output(clpipe, renders, workers,
         assert not contents("out")
     finally:
         workers.run(look_for, ".clpipe.lock")
-
-
-def test_a_worker_of_another_make_that_comes_later(clpipe, renders, address, monkeypatch):
-    probe = cluster.Cluster._probe
-
-    def earlier(self, jobs):
-        probe(self, jobs)
-        self._spec = replace(
-            self._spec, environment=replace(worker_environment(("numpy",)), device="another")
-        )
-
-    monkeypatch.setattr(cluster.Cluster, "_probe", earlier)
-    result = clpipe("run", "in", "-o", "out", "--dask", address, status=2)
-    assert "workers differ in their device" in result.stderr
-    assert not contents("out")
 
 
 def test_a_trace_is_told_by_one_clock(clpipe, renders, address):

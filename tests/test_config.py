@@ -20,69 +20,6 @@ def build(**settings):
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"demosiac": {"method": "bilinear"}}, "unknown stage 'demosiac' .*mean 'demosaic'"),
-        ({"demosaic": {"method": "biliner"}}, "demosaic.method: .*'biliner' .*mean 'bilinear'"),
-        (
-            {"sensor_noise": {"aa": 1}},
-            "unknown parameter of sensor_noise .*'aa'.*allowed: method, a, b",
-        ),
-        ({"sensor_noise": {"a": -1}}, r"sensor_noise.a: found -1: .*greater than or equal to 0"),
-        ({"sensor_noise": {"a": "much"}}, r"sensor_noise.a: found 'much': .*number"),
-        ({"sensor_noise": {"a": float("nan")}}, r"sensor_noise.a: found nan: .*finite"),
-        ({"mosaic": {"pattern": "RGBG"}}, "mosaic.pattern: found 'RGBG': .*'RGGB', 'BGGR', 'GRBG'"),
-        (
-            {"denoise": {"method": "mean", "luma_size": 4}},
-            "denoise.luma_size: found 4: it must be odd, 1 to 15",
-        ),
-        (
-            {"denoise": {"method": "median", "chroma_size": 7}},
-            "denoise.chroma_size: found 7: it must be odd, 1 to 5",
-        ),
-        (
-            {"mosaic_denoise": {"size": 17}},
-            "mosaic_denoise.size: found 17: it must be odd, 1 to 15",
-        ),
-        ({"stages": ["mosaic", "nosie"]}, "unknown stage 'nosie'"),
-        ({"skip": ["nosie"]}, "unknown stage 'nosie'"),
-        ({"stages": "mosaic"}, "stages: found 'mosaic', but expected a list"),
-        ({"iso": "high"}, "iso: found 'high', but expected a number"),
-        ({"isoo": 3}, "unknown key 'isoo' .*mean 'iso'"),
-        ({"iso": 50}, "iso: found 50, but camera sony-a7r2 goes from 100 to 25600"),
-        ({"camera": "sony-a7r9"}, r"unknown camera 'sony-a7r9': .*\(most similar: sony-a7r\)"),
-        ({"camera": "nowhere.toml"}, "nowhere.toml: there is no such file"),
-        (
-            {"stages": ["exposure", "demosaic"]},
-            "demosaic reads mosaic, but exposure gives rgb; list mosaic",
-        ),
-        ({"stages": ["demosaic"]}, "demosaic reads mosaic, but the input gives rgb"),
-        ({"skip": ["normalize"]}, "white_balance reads mosaic, but quantize gives raw.*normalize"),
-        (
-            {"skip": ["quantize"]},
-            "normalize reads raw, but black_level_error gives mosaic.*quantize",
-        ),
-        ({"stages": []}, "no stage is left to run"),
-        (
-            {"color_matrix": {"method": "given", "matrix": [[1, 0, 0], [0, 1, 0], [1, 1, 0]]}},
-            "color_matrix.matrix: found .*: the matrix is singular",
-        ),
-        (
-            {"color_matrix": {"method": "given", "matrix": [[1, 0, 0], [0, 1, 0]]}},
-            "color_matrix.matrix: found .*: expected three rows of three numbers",
-        ),
-        ({"white_balance": {"method": "white_patch", "percentile": 0}}, "percentile: found 0: "),
-        ({"white_balance": {"method": "white_patch", "percentile": 101}}, "percentile: found 101"),
-        ({"quantize": {"black_level": 600, "white_level": 500}}, "white_level must be above"),
-        ({"quantize": {"white_level": 500}}, "white_level must be above"),
-    ],
-)
-def test_a_bad_request_is_named(settings, message):
-    with pytest.raises(RequestError, match=message):
-        build(**settings)
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("iso = 100\n[sensor_noise]\na = -1\n", "line 3: sensor_noise.a: found -1"),

@@ -18,10 +18,13 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import load_stage_file
 from clpipe.chain.settings import settings_from
 from clpipe.commands.main import main
-from clpipe.engine.check import check_method
+from clpipe.engine.check import check_method, example
 from clpipe.engine.device import Device
+from clpipe.engine.runner import Runner
+from clpipe.stage import Kind
 from tests.conftest import ROOT, STILL_LIFE
 from tests.markdown import blocks
+from tests.test_cuts import in_tiles
 
 PAGE = ROOT / "CONTRIBUTING.md"
 TEXT = PAGE.read_text()
@@ -33,12 +36,17 @@ def block(language: str) -> str:
     return next(block.text for block in blocks(STAGES) if block.language == language)
 
 
-@pytest.mark.slow
-def test_the_example_stage_works(device, tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+@pytest.fixture
+def vignette(tmp_path, forget_stage_files):
+    """The files of the example, next to each other; this is the path of the stage file."""
     (tmp_path / "vignette.cl").write_text(block("c"))
     (tmp_path / "vignette.py").write_text(block("python"))
-    stage = load_stage_file(tmp_path / "vignette.py")
+    return tmp_path / "vignette.py"
+
+
+@pytest.mark.slow
+def test_the_example_stage_works(device, vignette):
+    stage = load_stage_file(vignette)
     for any_device in (device, Device(replace(device.info, lanes=1))):
         result = check_method(any_device, stage, stage.methods[0])
         assert result.difference.samples > 1000
@@ -68,11 +76,17 @@ def test_its_numbers_are_recorded_whatever_numpy_computes(tmp_path, monkeypatch)
 
 
 @pytest.mark.slow
-def test_the_commands_it_shows_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+def test_it_reads_places_in_the_image_also_in_tiles(device, vignette):
+    chain = make_chain(settings_from({"stages": [load_stage_file(vignette).name]}))
+    image = example(Kind.RGB, (150, 203))
+    result, count = in_tiles(Runner(chain, device, final=True), image, 64, 48)
+    assert count >= 6
+    assert np.abs(result.final - Runner(chain, None, final=True).run(image, "k").final).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_the_commands_it_shows_work(tmp_path, vignette, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "vignette.cl").write_text(block("c"))
-    (tmp_path / "vignette.py").write_text(block("python"))
     (tmp_path / "render.exr").write_bytes(STILL_LIFE.read_bytes())
     commands = [line.split()[1:] for line in block("sh").splitlines()]
     assert [command[0] for command in commands] == ["check", "stages", "run"]

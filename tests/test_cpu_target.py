@@ -13,7 +13,6 @@ from clpipe.engine.cpu_target import (
     TARGETS,
     Target,
     candidates,
-    compile_for,
     cpu_features,
     driver_target,
     equivalent_target,
@@ -140,42 +139,12 @@ def test_features_are_those_that_linux_lists_and_glibc_finds(monkeypatch):
     assert cpu_features.__wrapped__() is None
 
 
-def test_glibc_and_linux_agree_on_this_machine():
-    usable, listed = cpu_target._usable(), cpu_target._listed()
-    if usable is None or listed is None:
-        pytest.skip("needs Linux on x86-64, and glibc 2.33 or newer")
-    assert listed & frozenset(cpu_target._CPUID_BITS) == usable
-
-
 @pytest.fixture
 def pip_pocl(device):
     """The PoCL that the wheel brings: the one that the name is set in."""
     if "PoCL 3.0" not in device.info.handle.platform.version:
         pytest.skip("needs version 3.0 of the package pocl-binary-distribution")
     return device.info
-
-
-def test_the_place_of_the_name_is_found_in_pips_pocl(pip_pocl):
-    place = cpu_target._name_pointer(pip_pocl.handle)
-    assert place is not None and 0 < place - pip_pocl.handle.int_ptr < cpu_target.RECORD_BYTES
-    assert driver_target(pip_pocl.version)[0].startswith("x86_64-")
-    # Other texts are not there, so nothing is found, and nothing written.
-    other = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-no-such-cpu"
-    wrong = SimpleNamespace(version=other, int_ptr=pip_pocl.handle.int_ptr + 8)
-    assert cpu_target._name_pointer(wrong) is None
-    compile_for(wrong, Target("skx", ""))
-    nowhere = SimpleNamespace(version=pip_pocl.version, int_ptr=2**46 + 8)
-    assert cpu_target._name_pointer(nowhere) is None
-
-
-def test_a_name_can_be_set_more_than_once(pip_pocl):
-    before = pip_pocl.target
-    try:
-        for name in ("haswell", "haswell", "x86-64"):
-            compile_for(pip_pocl.handle, Target(name, ""))
-            assert cpu_target._texts[pip_pocl.handle.int_ptr].value == name.encode()
-    finally:
-        compile_for(pip_pocl.handle, before)
 
 
 RAW = """if True:

@@ -8,14 +8,14 @@ import OpenEXR
 import pytest
 
 import clpipe as clpipe_api
-from clpipe.base.errors import ImageError, RequestError
+from clpipe.base.errors import ImageError
 from clpipe.chain.layers import layer_of_array, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.runner import Runner
 from clpipe.images.read import read_image
 from tests.conftest import written
-from tests.test_tiles import in_tiles
+from tests.test_cuts import in_tiles
 
 # The disc of a point that is infinitely far: 100^2 / (4 (2000 - 100)) mm = 131.6 px of 10 um.
 LENS = {"focal_length": 100.0, "f_number": 4.0, "focus_distance": 2.0, "pixel_pitch": 10.0}
@@ -61,10 +61,10 @@ def test_the_kernel_is_the_reference(device, scalar_device, size, blades):
         )
 
 
-def test_tiles_have_the_same_bits(device, monkeypatch):
+def test_tiles_have_the_same_bits(device):
     image, depth = scene(150, 203)
     runner, _held = runner_for(image, depth, device, max_radius=5)
-    assert in_tiles(runner, image, 70, 56, monkeypatch)[1] >= 6
+    assert in_tiles(runner, image, 70, 56)[1] >= 6
 
 
 @pytest.mark.parametrize("distance", [at_radius(2.5), at_radius(7.2), at_radius(-9.0), 2.0])
@@ -199,24 +199,6 @@ def test_depth_that_cannot_be_used(render, clpipe, depth, options, message):
         render("a_depth.exr", Z=depth)
     failed = clpipe("run", "a.exr", "-o", "o", *RUN, *THIN, *options, status=1)
     assert message in " ".join(failed.output.split())
-
-
-@pytest.mark.parametrize(
-    ("lens", "message"),
-    [
-        (
-            {"focus_distance": 0.04},
-            "must be more than the focal length of 50 mm. Check depth_scale",
-        ),
-        ({"blades": 3}, "5 to 9 blades"),
-        ({"sensor_width": 36.0, "pixel_pitch": 5.0}, "set either sensor_width or pixel_pitch"),
-        ({"camera": "sony-imx686"}, "sensor_width: this stage needs the pixel size"),
-    ],
-)
-def test_lenses_that_cannot_be(lens, message):
-    camera = {k: lens.pop(k) for k in ["camera"] if k in lens}
-    with pytest.raises(RequestError, match=message):
-        make_chain(settings_from({**camera, "defocus": {"method": "thin_lens", **lens}}))
 
 
 def test_in_python():

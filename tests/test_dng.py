@@ -2,7 +2,6 @@
 
 import io
 import json
-import re
 
 import exifread
 import numpy as np
@@ -30,7 +29,6 @@ from tests.dng import write_dng as write_raw
 
 LINEAR = ("--skip", "denoise", "--skip", "tone_curve", "--skip", "sharpen")
 LINEAR += ("--set", "gamma.method=power", "--set", "gamma.exponent=1")
-NO_FILTERS = ("--set", "inverse_color_matrix.method=none")
 
 
 @pytest.fixture
@@ -324,29 +322,6 @@ def test_a_mosaic_from_elsewhere_as_a_dng(write_exr, tmp_path):
     inverse = np.linalg.inv(given)
     balanced = np.linalg.inv(inverse / inverse.sum(1, keepdims=True))
     assert to_srgb == pytest.approx(balanced, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--stages", "exposure,gamma"), "starts on rgb and has no quantize"),
-        (("--until", "sensor_noise"), "the DN that quantize produces"),
-        (("--until", "quantize", "--format", "jpg"), "ends in DN, but jpg cannot store DN"),
-        (("--set", "quantize.white_level=1000.5"), r"white level of 1000\.5, but DNG needs whole"),
-    ],
-)
-def test_a_chain_without_a_raw_is_refused(scene, tmp_path, options, message):
-    out = tmp_path / "o"
-    output = clpipe("run", scene(8, 8), "-o", out, "--format", "dng", *options, status=2)
-    assert re.search(message, output), output
-    assert not out.exists()
-
-
-def test_entering_after_the_raw_is_refused(write_exr, tmp_path):
-    mosaic = write_exr("m.exr", np.full((8, 8, 1), 0.5, np.float32), "Y")
-    options = ("--start-at", "white_balance", "--format", "dng")
-    output = clpipe("run", mosaic, "-o", tmp_path / "o", *options, status=2)
-    assert "starts on mosaic and has no quantize" in output
 
 
 @pytest.mark.parametrize("value", [0.5, -1, 65536, np.inf])

@@ -162,8 +162,7 @@ CHECKS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_EXAMPLES, ids=name_of)
-def test_the_examples_work(page, run_page, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})  # stages of a page stay there
+def test_the_examples_work(page, run_page, forget_stage_files):
     folder = run_page(page)
     if check := CHECKS.get(name_of(page)):
         check(folder)

@@ -14,7 +14,7 @@ from clpipe.chain.formats import ALL_FORMATS, extension_of
 from clpipe.images.whole import is_complete
 from clpipe.outputs.existing import is_marked
 from clpipe.outputs.sidecar import output_entries
-from tests.conftest import reseal
+from tests.conftest import contents, reseal, stamps, statuses
 
 RUN = ("-o", "out", "--device", "numpy", "--keep", "normalize", "--truth", "mosaic")
 MADE = ("a.jpg", "a.normalize.exr", "a.truth_mosaic.exr")
@@ -62,6 +62,56 @@ def test_what_is_missing_or_damaged_is_made_again(again, name, how):
     assert name in again()
     assert path.read_bytes() == before
     assert again() == []
+
+
+NUMPY = ("-o", "out", "--device", "numpy")
+KINDS = {
+    "pictures": (NUMPY, ["f0.jpg", "f1.jpg", "f2.jpg"]),
+    "patches": ((*NUMPY, "--patch", 6, "--patches-per-image", 2), ["f0_0000.jpg", "f1_0001.jpg"]),
+    "sequence": ((*NUMPY, "--sequence"), ["f0.jpg", "f1.jpg", "f2.jpg"]),
+    "tars": ((*NUMPY, "--webdataset", 2), ["000000.tar"]),
+    "tars of patches": (
+        (*NUMPY, "--webdataset", 2, "--patch", 6, "--patches-per-image", 2, "--keep", "quantize"),
+        ["000000.tar", "000001.tar"],
+    ),
+    "clips": ((*NUMPY, "--format", "mkv", "--codec", "ffv1"), ["f.mkv", "f.mkv.jsonl"]),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_of_each_kind_are_skipped_recomputed_or_left(clpipe, write_exr, kind):
+    options, names = KINDS[kind]
+    if kind == "clips":
+        pytest.importorskip("av", reason="needs PyAV: pip install av")
+    for number in range(3):
+        write_exr(f"in/f/f{number}.exr", np.full((8, 12, 3), 0.1 + 0.1 * number, np.float32))
+    run = ("run", "in/f", *options)
+    clpipe(*run)
+    before, whole = stamps(), contents("out")
+    clpipe(*run)
+    assert stamps() == before
+    assert set(statuses("out").values()) == {"skipped"}
+    for number, name in enumerate(names):
+        path = Path("out", name)
+        path.write_bytes(whole[name][: len(whole[name]) // 2])
+        clpipe(*run)
+        assert contents("out") == whole
+        path.write_bytes(b"somebody else's" * 20_000)
+        for json_ in path.parent.glob(f"{path.stem.partition('_')[0]}*.json"):
+            json_.unlink()
+        stderr = clpipe(*run, status=(1, 2)).stderr
+        assert f"{path}: clpipe did not write this " in stderr
+        assert path.read_bytes().startswith(b"somebody")
+        clpipe(*run, "--redo", "all")
+        assert contents("out") == whole
+        before = stamps()
+        write_exr("in/f/f1.exr", np.full((8, 12, 3), 0.6 + 0.1 * number, np.float32))
+        clpipe(*run)
+        made = {name for name, at in stamps().items() if before.get(name) != at}
+        assert made == {each for each in before if each.startswith(("f1", "f.", "000000"))}
+        whole = contents("out")
+    clpipe(*run, "--seed", 1)
+    assert set(statuses("out").values()) == {"done"}
 
 
 @pytest.mark.parametrize("name", MADE)

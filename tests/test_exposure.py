@@ -190,25 +190,6 @@ def test_an_exposure_of_a_bracket_is_replayed(clpipe, write_exr, tmp_path, scene
         assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--bracket", "-2,x"], "--bracket: found '-2,x'; expected EVs, such as -2,0,2"),
-        (["--bracket", "nan"], "expected EVs"),
-        (["--bracket", "1e-9,0"], "expected EVs"),
-        (["--bracket", "1,1.0"], "found '1,1.0', which repeats +1 EV; list each EV once"),
-        (
-            ["--bracket", "0,30"],
-            "+30 EV added to exposure.ev=0 is not allowed; exposure.ev: found 30",
-        ),
-        (["--bracket", "1", "--skip", "exposure"], "this chain has no stage exposure: "),
-    ],
-)
-def test_brackets_that_are_refused(clpipe, write_exr, options, message):
-    write_exr("view.exr", np.zeros((4, 4, 3)))
-    assert message in clpipe("run", "view.exr", "-o", "out", *options, status=2).stderr
-
-
 @pytest.fixture
 def sequence(write_exr, scene):
     for folder, gains in {"day": (1, 1, 8, 8), "night": (0.01, 0.01)}.items():

@@ -16,7 +16,6 @@ from clpipe.base.numbers import float32, pure
 from clpipe.base.tracing import NotTraceableError, Trace, call
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import COMPUTED, Chain
-from clpipe.chain.families import ComputedChain
 from clpipe.chain.limits import field_limits
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
@@ -55,47 +54,6 @@ def assert_equal(chain, other):
             if not isinstance(value, CompileTime):
                 assert value.tobytes() == expected.tobytes(), (step.name, name)
     assert [repr(step.method) for step in chain.steps] == [repr(s.method) for s in other.steps]
-
-
-DRAWN = {
-    "iso": ({}, "iso", (100, 25600)),
-    "ev": ({}, "exposure.ev", (-2, 2)),
-    "shot noise": ({}, "sensor_noise.a", (1e-5, 1e-2)),
-    "system gain": ({}, "sensor_noise.system_gain", (0.1, 10)),
-    "tukey": ({}, "sensor_noise.tukey_lambda", (-0.3, 0.3)),
-    "poisson": ({"sensor_noise": {"method": "poisson"}}, "sensor_noise.a", (1e-5, 1e-2)),
-    "light": ({}, "inverse_white_balance.red_gain", (1.1, 3)),
-    "blur": ({}, "optical_blur.sigma", (0.3, 0.8)),
-    "streak": ({}, "motion_blur.length", (0.0, 4)),
-    "strength": ({}, "denoise.luma_strength", (0, 2)),
-    "bilateral": ({"denoise": {"method": "bilateral"}}, "denoise.chroma_strength", (0.5, 2)),
-    "gamma": ({"gamma": {"method": "power"}}, "gamma.exponent", (1.8, 2.6)),
-    "temperature": ({"dark_current": {"exposure_time": 4.0}}, "dark_current.temperature", (0, 50)),
-    "distortion": (
-        {"distortion": {"method": "brown_conrady", "fx": 40.0}},
-        "distortion.k1",
-        (-0.1, 0.1),
-    ),
-    "flicker": ({"shutter": {"flicker_depth": 0.5}}, "shutter.flicker_frequency", (50, 200)),
-}
-
-
-@pytest.mark.parametrize("name", DRAWN)
-def test_a_computed_chain_is_the_one_that_is_made(name, families, monkeypatch):
-    base, key, (low, high) = DRAWN[name]
-    general = settings_from({"camera": "sony-a7r2", **base})
-    step, _, parameter = key.rpartition(".")
-    for number in range(12):
-        value = low + (high - low) * ((number * 0.618) % 1)
-        values = {step: {parameter: float(value)}} if step else {parameter: float(value)}
-        settings = overlay(general, values)
-        chain, expected = make_chain(settings), made(settings, monkeypatch)
-        assert_equal(chain, expected)
-        assert_equal(chain.without_noise_or_denoising(), expected.without_noise_or_denoising())
-        assert_equal(chain.without_noise(), expected.without_noise())
-        assert chain.settings is settings
-        arguments = [{s.name: s.arguments for s in c.steps} for c in (chain, expected)]
-        assert chain_ops(chain, arguments[0]) == chain_ops(expected, arguments[1])
 
 
 def numbers_of_stages():
@@ -155,19 +113,6 @@ def assert_alike(chain, expected):
         assert_equal(derived(chain), truth)
 
 
-@pytest.mark.parametrize("camera", built_in_cameras())
-def test_one_camera_has_few_families(camera, families, monkeypatch):
-    general = settings_from({"camera": camera})
-    low, high = load_camera(camera).iso_range
-    chains = []
-    for number in range(24):
-        iso = low * (high / low) ** ((number * 0.618) % 1)
-        chains.append(make_chain(overlay(general, {"iso": iso})))
-    assert_equal(chains[-1], made(chains[-1].settings, monkeypatch))
-    assert chains[-1].structure is not None
-    assert sum(isinstance(chain, ComputedChain) for chain in chains) >= 16
-
-
 def test_chains_of_one_structure_have_one_plan(families):
     general = settings_from({"camera": "canon-5d2"})
     chains = [make_chain(overlay(general, {"iso": iso})) for iso in (400.0, 500, 620, 710, 730)]
@@ -176,14 +121,6 @@ def test_chains_of_one_structure_have_one_plan(families):
     assert one.without_noise_or_denoising().structure is not one.structure
     ops = [chain_ops(c, {s.name: s.arguments for s in c.steps}) for c in (one, other)]
     assert ops[0] == ops[1]
-
-
-def test_a_value_that_is_not_allowed_is_refused_in_a_family_too(families):
-    general = settings_from({"camera": "canon-5d2"})
-    for iso in (400.0, 500.0, 600.0):
-        make_chain(overlay(general, {"iso": iso}))
-    with pytest.raises(RequestError, match="goes from 100 to 6400"):
-        make_chain(overlay(general, {"iso": 1e6}))
 
 
 def test_code_that_computes_beside_its_arguments_is_found_out(families, monkeypatch):

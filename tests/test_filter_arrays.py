@@ -16,7 +16,7 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
 from clpipe.chain.settings import settings_from
 from clpipe.dataset import Dataset
-from clpipe.engine.check import ARRAYS, compare, mosaic_parameters, sensor_parameters
+from clpipe.engine.check import ARRAYS, mosaic_parameters
 from clpipe.engine.runner import Runner
 from clpipe.images.dng import write_dng
 from clpipe.images.raw import read_raw, read_raw_info
@@ -36,11 +36,9 @@ from clpipe.stages import DEFAULT_CHAIN
 from clpipe.stages.mosaic import responses_of
 from tests.conftest import STILL_LIFE
 from tests.photographs import photographs
-from tests.test_tiles import in_tiles
 
 GAINS = (2.0, 1.6)
 BLIND = ("mono", "RCCC")  # arrays that cannot tell all colours
-RAW = ("sensor_noise", "row_noise", "column_noise")
 
 
 def on(array: str, **settings):
@@ -155,39 +153,6 @@ def test_a_polarised_array_has_no_colours():
     stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
     gray = Runner(on("polarised", stages=stages), None, final=True, encode=False).run(flat, "k")
     np.testing.assert_allclose(gray.final, 0.2, atol=1e-6)
-
-
-def test_neighbours_outside_the_image_continue_the_array(device):
-    effects = sensor_parameters()
-    stages = {name: effects[name] for name in ("crosstalk", "blooming")}
-    chain = on("x-trans", stages=["mosaic", *stages], **stages)
-    assert compare(device, chain, [(37, 53), (1, 40)]).largest == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("array", "lanes"), [("x-trans", "many"), ("RGBW", "one")])
-def test_the_raw_is_the_same_bit_for_bit(device, scalar_device, array, lanes):
-    stages = settings_from({}).stages
-    until = {"stages": [*stages[: stages.index("quantize") + 1]], **sensor_parameters()}
-    chain = on(array, **until)
-    assert chain.steps[-1].name == "quantize"
-    on_device = scalar_device if lanes == "one" else device
-    found = compare(on_device, chain, [(37, 53), (1, 40), (40, 1)], half=True)
-    assert (found.largest, found.differing) == (0, 0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("array", "method"),
-    [("RGB/GBR/BRG", "linear_mmse"), ("x-trans", "directional_mmse")],
-)
-def test_tiles_and_patches_have_the_bits_of_the_whole(device, monkeypatch, array, method):
-    stages = ["mosaic", "inverse_white_balance", "white_balance", "demosaic"]
-    chain = on(array, stages=stages, demosaic={"method": method})
-    image = np.random.default_rng(3).random((203, 310, 3)).astype(np.float16)
-    runner = Runner(chain, device, keep=("mosaic",), encode=False, final=True)
-    _, count = in_tiles(runner, image, 96, 64, monkeypatch)
-    assert count > 3
 
 
 @pytest.mark.parametrize("array", [*NAMED, "RG/GB", "RGB/GBR/BRG"])
@@ -596,24 +561,6 @@ def test_a_cell_of_charge_saturates_as_one_readout(develop):
     assert kept.shape == (8, 8)
     assert kept[0::2, 1::2] == pytest.approx(1)  # green has 1.2 of its white
     assert (kept[0::2, 0::2] < 0.5).all()  # red has not
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("array", "method"),
-    [("quad-RGGB", "binning"), ("nona-RGGB", "binning"), ("x-trans", "linear_mmse")],
-)
-def test_remosaicing_in_tiles(device, monkeypatch, array, method):
-    stages = ["mosaic", "inverse_white_balance", "white_balance", "remosaic", "demosaic"]
-    demosaic = {"method": "bilinear"}
-    chain = on(array, stages=stages, remosaic={"method": method}, demosaic=demosaic)
-    image = np.random.default_rng(3).random((203, 310, 3)).astype(np.float16)
-    whole, count = in_tiles(
-        Runner(chain, device, encode=False, final=True), image, 96, 64, monkeypatch
-    )
-    assert count > 3
-    found = Runner(chain, None, encode=False, final=True).run(image, "k").final
-    np.testing.assert_allclose(found, whole.final, atol=1e-6)
 
 
 def test_a_remosaiced_picture_is_as_the_array_saw_it(develop):

@@ -212,15 +212,6 @@ def test_a_dataset_prints_its_log(clpipe, folder):
     assert len(lines) == 3 and lines[1]["status"] == "done"
 
 
-def test_every_command_has_output_for_programs():
-    """The page on outputs says so."""
-    for name in COMMANDS:
-        command = main.get_command(click.Context(main), name)
-        options = {option for each in command.params for option in each.opts}
-        expected = {"run": "--json-lines", "dataset": "--json-lines", "stream": "--log"}
-        assert expected.get(name, "--json") in options
-
-
 def test_a_dataset_of_renders_needs_no_cameras(clpipe, folder):
     clpipe("dataset", "renders", "-o", "set", "--device", "numpy")
     assert Path("set/manifest.csv").is_file() and not list(Path("set").rglob("cameras.json"))

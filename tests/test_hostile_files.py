@@ -325,25 +325,12 @@ def test_a_damaged_tar_is_nobodys_and_holds_nothing(tmp_path, data):
 
 def test_a_pipe_in_the_output_folder_does_not_make_a_run_wait(clpipe, write_exr):
     path = write_exr("a.exr", np.full((4, 6, 3), 0.25))
-    for name in ("out/a.json", "tars/000000.tar", "t.json"):
-        Path(name).parent.mkdir(exist_ok=True)
+    Path("tars").mkdir()
+    for name in ("tars/000000.tar", "t.json"):
         os.mkfifo(name)
-    run = ("run", path, "--device", "numpy")
-    assert (
-        "a.json: this file cannot be read: it is a named pipe"
-        in clpipe(*run, "-o", "out", status=1).output
-    )
-    os.remove("out/a.json")
-    os.mkfifo("out/a.jpg")
-    assert "did not write this file" in clpipe(*run, "-o", "out", status=1).output
-    clpipe(*run, "-o", "out", "--redo", "all")
-    assert Path("out/a.jpg").is_file()
-    assert (
-        "did not write this tar" in clpipe(*run, "-o", "tars", "--webdataset", 1, status=2).output
-    )
-    assert (
-        "exists and is not a trace" in clpipe(*run, "-o", "x", "--trace", "t.json", status=2).output
-    )
+    run = ("run", path, "--device", "numpy", "-o")
+    assert "did not write this tar" in clpipe(*run, "tars", "--webdataset", 1, status=2).output
+    assert "exists and is not a trace" in clpipe(*run, "x", "--trace", "t.json", status=2).output
 
 
 def test_an_image_of_very_many_parts_is_refused(tmp_path, monkeypatch):

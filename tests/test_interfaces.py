@@ -126,20 +126,6 @@ def test_warnings_point_at_the_call_of_the_user(files):
     assert {each.filename for each in (*caught, *skipped)} == {__file__}
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--memory", "lots"), "clpipe: --memory: 'lots' is not a size"),
-        (("--patch", 8, "--patches-per-image", "few"), "clpipe: --patches-per-image: found 'few'"),
-        (("--set", "denoise=2"), "'clpipe stages denoise' lists the parameters of this stage"),
-        (("--iso", "random"), "write iso = {log_uniform = [100, 6400]} in a configuration"),
-    ],
-)
-def test_wrong_words_of_a_command(files, clpipe, words, message):
-    stderr = " ".join(clpipe("run", "in", "-o", "o", *words, status=2).stderr.split())
-    assert message in stderr and "Invalid value" not in stderr
-
-
 def test_an_archive_is_named_as_a_url(files, clpipe):
     Path("a.zip").write_bytes(b"none")
     assert "name zip://::FILE.zip" in clpipe("run", "a.zip", "-o", "o", status=2).stderr

@@ -1,6 +1,5 @@
 """The kernel cache is verified before use, and private to the user."""
 
-import io
 import json
 import mmap
 import os
@@ -110,39 +109,6 @@ def test_a_program_is_built_and_kept(builder, tmp_path):
     assert builder(text) == 7
 
 
-def test_an_entry_that_pocl_does_not_use_is_replaced(builder, device, tmp_path, caplog):
-    """PoCL derives a program's folder from more than clpipe knows, such as the paths of headers."""
-    if "Portable Computing" not in device.info.platform:
-        pytest.skip("looks at PoCL's programs")
-    text = text_of(tmp_path)
-    put(tmp_path / "other/AB/CDEF/f/1-1-1/f.so")
-    packed = builders._pack(tmp_path / "other", "AB/CDEF", frozenset({"f/1-1-1/f.so"}))
-    builder.store.keep(packed, text, "-w")
-    with caplog.at_level("DEBUG", logger=builders.log.name):
-        assert builder(text) == 7
-    assert [record.message for record in caplog.records] == [COMPILED]
-    names = zipfile.ZipFile(io.BytesIO(builder.store.load(text, "-w"))).namelist()
-    assert any(name.endswith(".so") for name in names)
-    assert not any(name.startswith("AB/CDEF") for name in names)
-
-
-def test_what_a_simultaneous_process_stored_stays(builder, device, tmp_path):
-    if "Portable Computing" not in device.info.platform:
-        pytest.skip("looks at PoCL's programs")
-    text = text_of(tmp_path)
-    pocl = Path(os.environ["POCL_CACHE_DIR"])
-    one = PoclBuilder(builder.context, builder.store, pocl)
-    program = one.build(text, ["-w"])
-    ((name, _),) = one._built.values()
-    put(tmp_path / "other" / name / "f/9-9-9/f.so")
-    packed = builders._pack(tmp_path / "other", name, frozenset({"f/9-9-9/f.so"}))
-    builder.store.keep(packed, text, "-w")
-    assert program.all_kernels()
-    one.keep()
-    names = zipfile.ZipFile(io.BytesIO(builder.store.load(text, "-w"))).namelist()
-    assert f"{name}/f/9-9-9/f.so" in names and f"{name}/program.bc" in names
-
-
 def test_a_program_that_cannot_be_stored_is_named_once(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(Store, "keep", lambda *_: False)
     monkeypatch.setattr(builders, "cache_problem", lambda: "")
@@ -184,19 +150,6 @@ def test_what_a_runtime_does_not_take_is_compiled(builder, device):
     assert builder(made=binary) == 7
 
 
-def test_a_packed_program_is_put_back(tmp_path):
-    program = tmp_path / "one/AB/CDEF"
-    put(program / "program.bc", b"bytecode")
-    put(program / "last_accessed")
-    put(program / "f/8-1-1/f.so", b"library")
-    assert builders._list_programs(tmp_path / "one") == {"AB/CDEF"}
-    files = builders._list_files(program)
-    assert files == {"program.bc", "f/8-1-1/f.so"}
-    builders._unpack(builders._pack(tmp_path / "one", "AB/CDEF", files), tmp_path / "two")
-    assert builders._list_files(tmp_path / "two/AB/CDEF") == files
-    assert (tmp_path / "two/AB/CDEF/f/8-1-1/f.so").read_bytes() == b"library"
-
-
 def test_a_library_in_use_is_not_written_to(tmp_path):
     path = put(tmp_path / "one/AB/CDEF/f.so", b"library")
     packed = builders._pack(tmp_path / "one", "AB/CDEF", frozenset({"f.so"}))
@@ -206,15 +159,20 @@ def test_a_library_in_use_is_not_written_to(tmp_path):
         assert mapped[:] == path.read_bytes() == b"running"
 
 
-def test_nothing_is_put_elsewhere(tmp_path):
-    path = tmp_path / "a.zip"
-    names = ["../x", "/x", "AB/../x", "AB/CD/../../../x", "AB/CD/./x", "x", "AB/cd/x"]
-    with zipfile.ZipFile(path, "w") as archive:
-        for name in names:
-            archive.writestr(name, b"data")
-    builders._unpack(path.read_bytes(), tmp_path / "folder")
-    builders._unpack(b"no archive", tmp_path / "folder")
-    assert sorted(tmp_path.rglob("*")) == [path]
+@pytest.mark.parametrize("archive", [True, False])
+def test_nothing_is_put_elsewhere(builder, device, tmp_path, archive):
+    if "Portable Computing" not in device.info.platform:
+        pytest.skip("looks at PoCL's programs")
+    text, path = text_of(tmp_path), put(tmp_path / "a.zip", b"no archive")
+    if archive:
+        names = ["../{}", "/{}", "AB/../{}", "AB/CD/../../../{}", "AB/CD/./{}", "{}", "AB/cd/{}"]
+        with zipfile.ZipFile(path, "w") as file:
+            for name in names:
+                file.writestr(name.format("elsewhere"), b"data")
+    builder.store.keep(path.read_bytes(), text, "-w")
+    assert builder(text) == 7
+    assert not list(Path(os.environ["POCL_CACHE_DIR"]).parent.rglob("elsewhere"))
+    assert not Path("/elsewhere").exists()
 
 
 def test_without_room_to_compile_pocl_is_not_asked(tmp_path, monkeypatch):

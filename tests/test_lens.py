@@ -21,7 +21,7 @@ from clpipe.reference.radial import Radial
 from clpipe.reference.warp import FILTERS, Warp
 from clpipe.stage import Kind
 from clpipe.stages.distortion import BrownConrady, Fisheye, PtLens
-from tests.test_tiles import in_less_memory
+from tests.test_cuts import in_less_memory
 
 BARREL = {"method": "brown_conrady", "focal_length": 30.0, "sensor_width": 36.0, "k1": -0.3}
 BROWN = BrownConrady(
@@ -140,7 +140,7 @@ def test_what_the_lens_does_not_see_is_black_and_fit_leaves_none(device):
 
 
 @pytest.mark.parametrize("k1", [-0.3, 0.6])
-def test_tiles_have_the_same_bits_where_much_is_bent(device, monkeypatch, k1):
+def test_tiles_have_the_same_bits_where_much_is_bent(device, k1):
     chain = chain_of(**{**BARREL, "k1": k1})
     runner = Runner(chain, device, encode=False, final=True)
     for size in ((650, 803), (801, 301)):
@@ -149,7 +149,7 @@ def test_tiles_have_the_same_bits_where_much_is_bent(device, monkeypatch, k1):
             r.run(image, "k").final for r in (runner, Runner(chain, None, final=True))
         )
         assert np.array_equal(on_device, in_numpy)
-        in_less_memory(runner, image, monkeypatch)
+        in_less_memory(runner, image)
 
 
 def test_a_lens_that_folds_the_image_is_refused(clpipe, write_exr):

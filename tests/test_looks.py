@@ -189,4 +189,4 @@ def test_python_takes_several_too(render, tmp_path):
         for folder in "oc"
     ]
     assert configs[0] == configs[1]
-    assert api.Pipeline(names, device="numpy")._settings == load_settings(*names)
+    assert api.Pipeline(names, device="numpy").settings == load_settings(*names)

@@ -61,37 +61,21 @@ def clock(monkeypatch):
     return now
 
 
-class Entering:
-    """Take budget in a thread, and return whether it waits."""
+def waiting(budget, *arguments):
+    """Take budget in a thread that has to wait, and return a function that waits for its end."""
+    entered = threading.Event()
 
-    def __init__(self, budget, *arguments):
-        self._budget, self._arguments = budget, arguments
-        self._settled, self._has_entered = threading.Event(), False
-        wait = budget._changed.wait
+    def enter():
+        budget.acquire(*arguments)
+        entered.set()
 
-        def noted(timeout=None):
-            self._settled.set()
-            return wait(timeout)
+    threading.Thread(target=enter, daemon=True).start()
+    assert not entered.wait(0.05)
 
-        budget._changed.wait = noted
-        self._thread = threading.Thread(target=self._enter, daemon=True)
-        self._thread.start()
+    def finish():
+        assert entered.wait(GUARD)
 
-    def _enter(self):
-        try:
-            self._budget.acquire(*self._arguments)
-            self._has_entered = True
-        finally:
-            self._settled.set()
-
-    @property
-    def has_to_wait(self):
-        assert self._settled.wait(GUARD)
-        return not self._has_entered
-
-    def finish(self):
-        self._thread.join(GUARD)
-        assert self._has_entered
+    return finish
 
 
 def test_what_never_fits_is_refused_and_what_fits_is_let_in():
@@ -107,10 +91,9 @@ def test_what_never_fits_is_refused_and_what_fits_is_let_in():
 def test_what_fits_alone_waits_for_the_others():
     budget = budget_of(200 * MIB, size=100 * MIB)
     small = budget.acquire(10 * MIB)
-    large = Entering(budget, 120 * MIB)
-    assert large.has_to_wait
+    finish = waiting(budget, 120 * MIB)
     small.release()
-    large.finish()
+    finish()
 
 
 def test_for_a_large_image_devices_hold_little():
@@ -155,10 +138,9 @@ def test_large_images_wait_for_the_compiler():
         None, (SharingDevice(0),), left=lambda: FreeMemory(COMPILE_MEMORY + 100 * MIB, "")
     )
     budget.acquire(10 * MIB).release()
-    large = Entering(budget, 150 * MIB)
-    assert large.has_to_wait
+    finish = waiting(budget, 150 * MIB)
     budget.device_ready()
-    large.finish()
+    finish()
 
 
 def test_nothing_is_let_in_at_the_end():
@@ -167,17 +149,6 @@ def test_nothing_is_let_in_at_the_end():
     budget.close()
     with pytest.raises(ImageError, match="ended"):
         budget.acquire(60 * MIB)
-
-
-def test_small_images_are_not_slowed_by_measuring(clock):
-    count = []
-    budget = MemoryBudget(None, (), left=lambda: count.append(1) or FreeMemory(2**34, ""))
-    for _ in range(100):
-        budget.acquire(MIB)
-    assert len(count) == 1
-    clock[0] += 2 * memory_budget.MEASUREMENT_SECONDS
-    budget.acquire(MIB)
-    assert len(count) == 2
 
 
 def test_what_files_claim(write_exr, tmp_path):

@@ -21,7 +21,7 @@ from clpipe.inputs.subframes import weights_of
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.stage import Kind
 from clpipe.stages.shutter import Rows
-from tests.test_tiles import in_less_memory
+from tests.test_cuts import in_less_memory
 
 K1, FX = -0.12, 50.3
 BARREL = {"method": "brown_conrady", "fx": FX, "k1": K1}
@@ -97,7 +97,7 @@ def test_beyond_the_data_window_it_is_black():
 
 
 @pytest.mark.parametrize("k1", [-0.12, 0.6])
-def test_tiles_have_the_same_bits(device, monkeypatch, k1):
+def test_tiles_have_the_same_bits(device, k1):
     margins, size = Margins(40, 131, 97, 6), (301, 540)
     own = {**BARREL, "k1": k1, "fx": 430.0}
     runner = Runner(chain_of(margins, distortion=own), device, encode=False, final=True)
@@ -105,7 +105,7 @@ def test_tiles_have_the_same_bits(device, monkeypatch, k1):
     whole = runner.run(image, "k")
     assert whole.final.shape == (540, 301, 3)
     assert np.array_equal(whole.final, bent(image, margins, distortion=own).final)
-    in_less_memory(runner, image, monkeypatch)
+    in_less_memory(runner, image)
 
 
 def test_fit_makes_no_use_of_more_than_fills_the_picture():

@@ -18,18 +18,6 @@ from clpipe.reference.cfa import red_site
 from clpipe.stages import DEFAULT_CHAIN
 from tests.conftest import STILL_LIFE
 
-SETTINGS = [
-    {"iso": 3200},
-    {"iso": 800, "white_balance": {"method": "gray_world"}, "mosaic": {"pattern": "GBRG"}},
-    {"iso": 1600, "demosaic": {"method": "bilinear"}, "skip": ["denoise"]},
-    {
-        "white_balance": {"method": "white_patch"},
-        "color_matrix": {"method": "camera"},
-        "tone_curve": {"method": "linear"},
-        "gamma": {"method": "srgb"},
-    },
-]
-
 
 @pytest.fixture(scope="module")
 def still_life():
@@ -38,36 +26,6 @@ def still_life():
 
 def runner(settings, device, **options):
     return Runner(make_chain(settings_from(settings)), device, **options)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("settings", SETTINGS[1::2])
-@pytest.mark.parametrize("shape", [(67, 101), (1, 40)])
-def test_what_is_kept_changes_no_bit(device, still_life, settings, shape):
-    image = np.ascontiguousarray(still_life[200 : 200 + shape[0], 300 : 300 + shape[1]])
-    plain = runner(settings, device)
-    expected = plain.run(image, "k").encoded
-    steps = [step.name for step in plain.chain.steps]
-    keep = ["normalize", "demosaic"] if len(settings) > 2 else ["sensor_noise", "tone_curve"]
-    result = runner(settings, device, keep=keep).run(image, "k")
-    assert np.array_equal(result.encoded, expected)
-    everything = runner(settings, device, keep=steps, final=True).run(image, "k")
-    assert np.array_equal(everything.encoded, expected)
-    assert np.array_equal(everything.kept[steps[-1]], everything.final)
-
-
-@pytest.mark.parametrize("settings", SETTINGS)
-def test_device_and_numpy_agree(device, still_life, settings):
-    image = np.ascontiguousarray(still_life[100:301, 250:553])
-    steps = ["quantize", "demosaic"]
-    on_device = runner(settings, device, keep=steps)
-    one, two = on_device.run(image, "k"), runner(settings, None, keep=steps).run(image, "k")
-    tolerance = on_device.chain.step_named("demosaic").method.tolerance or 1e-6
-    assert np.array_equal(one.kept["quantize"], two.kept["quantize"])
-    assert np.abs(one.kept["demosaic"] - two.kept["demosaic"]).max() < tolerance
-    assert np.abs(one.encoded.astype(int) - two.encoded).max() <= 1
-    for step, values in two.estimates.items():
-        assert one.estimates[step] == pytest.approx(values, rel=1e-6)
 
 
 def test_images_of_all_sizes_one_after_the_other(device, still_life):

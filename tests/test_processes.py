@@ -1,7 +1,7 @@
 """A run with several processes: the same bytes, even if a process dies."""
 
+import errno
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -14,9 +14,7 @@ import pytest
 import clpipe as package
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.batch import processes
-from clpipe.batch.local_worker import ProcessConfig
 from clpipe.batch.run_log import read_log
-from clpipe.batch.spec import RunSpec
 from tests.conftest import ROOT, contents, statuses, written
 from tests.held import GO, HOLDING_PROCESSES, finish, interrupt, start, wait_until
 
@@ -93,8 +91,8 @@ def test_processes_end_with_the_one_that_started_them(clpipe, renders):
     renders(30)
     process, others = held_run()
     process.kill()
-    finish(process)
     wait_until(lambda: not any(map(is_running, others)), "the end of the other processes")
+    assert "Traceback" not in finish(process)
     assert pictures() <= 20
     result = clpipe("run", "in", *RUN)
     assert "30 of 30 images done (" in result.stderr
@@ -207,23 +205,6 @@ def test_ctrl_c_does_not_reach_a_process_before_its_first_line(renders, monkeypa
     assert [outcome.status for outcome in run] == ["done"] * 2
 
 
-@pytest.mark.parametrize("gone", ["before it says what to do", "after it says what to do"])
-def test_a_process_whose_run_has_gone_ends_silently(renders, monkeypatch, gone):
-    renders(1)
-    ours, theirs = multiprocessing.Pipe()
-    if gone.startswith("after"):
-        run = package.run("in", "out", device="numpy")
-        ours.send((RunSpec(run._request, run.execution, run.jobs[0]), ProcessConfig(0, 1, 1)))
-    ours.close()
-    ended = subprocess.run(
-        [sys.executable, "-c", f"import sys; {processes.START}", str(theirs.fileno())],
-        pass_fds=[theirs.fileno()],
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    assert (ended.returncode, ended.stderr) == (1, b"")
-
-
 def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tmp_path, clpipe):
     renders(4)
     Path("json.py").write_text("raise SystemExit('not yours')\n")
@@ -240,13 +221,14 @@ def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tm
 
 def test_fewer_processes_where_the_system_gives_no_more(renders, monkeypatch):
     renders(6)
-    start_ = processes.Processes._start
+    started, popen = [], subprocess.Popen
 
-    def limited(self, number):
-        if number:
-            raise RequestError("no process can be started")
-        return start_(self, number)
+    def limited(*arguments, **options):
+        if started:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        started.append(popen(*arguments, **options))
+        return started[-1]
 
-    monkeypatch.setattr(processes.Processes, "_start", limited)
+    monkeypatch.setattr(subprocess, "Popen", limited)
     run = package.run("in", "out", processes=3, device="numpy")
     assert [outcome.status for outcome in run] == ["done"] * 6

@@ -227,25 +227,6 @@ def test_settings_that_an_image_carries_may_be_of_no_use(kept, tmp_path):
         assert f"{number}.exr: the settings in its attributes cannot be used" in output
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--start-at", "denoize"), "unknown stage in this chain 'denoize' .*'denoise'"),
-        (("--until", "denoise_2"), "unknown stage in this chain 'denoise_2'"),
-        (("--start-at", "gamma", "--until", "mosaic"), "gamma comes after mosaic"),
-        (("--until", "demosaic", "--keep", "gamma"), "unknown stage in this chain 'gamma'"),
-        (
-            ("--until", "quantize", "--format", "jpg"),
-            "the chain ends in DN, but jpg cannot store DN",
-        ),
-    ],
-)
-def test_a_part_that_cannot_be_run(kept, tmp_path, options, message):
-    output = clpipe("run", kept / "crop.exposure.exr", "-o", tmp_path, *options, status=2)
-    assert re.search(message, output), output
-    assert not list(tmp_path.iterdir())
-
-
 def test_until_gives_a_float_image_unless_it_is_the_end(tmp_path):
     image = crop(tmp_path)
     clpipe("run", image, "-o", tmp_path / "a", "--until", "white_balance", *NUMPY)

@@ -103,14 +103,6 @@ def test_damaged_files_cost_nothing(tmp_path):
     refused(*damaged, *renamed)
 
 
-def test_max_pixels_on_the_command_line(tmp_path, write_exr):
-    path = write_exr("a.exr", np.zeros((6, 9, 3)))
-    command = ("run", path, "-o", tmp_path / "out", "--max-pixels")
-    output = run_cli(*command, 53, status=1).output
-    assert "a.exr: this file has 9x6 pixels; at most 53 are read" in output
-    run_cli(*command, 54)
-
-
 def test_luminance_and_chroma(tmp_path):
     """A picture comes back from luminance and chroma where its colours change linearly."""
     height, width = 12, 18

@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,7 @@ import pytest
 from clpipe.base.errors import RequestError
 from clpipe.chain.request import RECORDED_FIELDS, Request
 from clpipe.chain.settings import settings_from
-from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.stage import Method
 from tests.conftest import reseal
 
 OPTIONS = {
@@ -116,8 +113,7 @@ def test_what_an_image_carries_stands_below_configuration_and_options():
     assert settings.parameters == {"exposure": {"ev": 1}, "gamma": {"method": "srgb"}}
 
 
-def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkeypatch):
-    monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, forget_stage_files):
     file = tmp_path / "sent.py"
     file.write_text(STAGE_FILE.format(mark=str(tmp_path / "ran"), name="sent"))
     values = {"stages": ["exposure", "sent"], "sent": {"method": "nothing"}}
@@ -129,31 +125,9 @@ def test_a_request_and_its_loader_can_be_sent_with_a_stage_file(tmp_path, monkey
     assert sent.chain.names == loader.chain.names
 
 
-def test_a_run_validates_the_parameters_of_a_step_once(monkeypatch):
-    counts = Counter()
-    validate = Method.model_validate.__func__
-
-    def counted(cls, values, **options):
-        counts[cls.__name__, json.dumps(values)] += 1
-        return validate(cls, values, **options)
-
-    monkeypatch.setattr(Method, "model_validate", classmethod(counted))
-    values = {"exposure": {"ev": 0.5}, "denoise": {"luma_size": 3}}
-    request = Request.from_options(config="paper", values=values)
-    loader = ImageLoader(request)
-    jobs = [Job(Path("a.exr"), "a"), Job(Path("b.exr"), "b", values={"iso": 800})]
-    loader.check(jobs)
-    request = request.with_outputs(loader.first_chain(jobs))
-    for job in jobs:
-        assert loader.for_job(job).chain.steps
-        request.for_image(job.key, job.values).record()
-    own = {k: n for k, n in counts.items() if k[0] not in ("Linear", "Levels")}
-    assert len(own) >= 4 and set(own.values()) == {1}, counts
-
-
-def test_no_code_comes_from_a_sidecar(clpipe, write_exr, monkeypatch):
+def test_no_code_comes_from_a_sidecar(clpipe, write_exr, forget_stage_files):
     def forget():
-        monkeypatch.setattr("clpipe.chain.registry._from_files", {})
+        forget_stage_files()
         Path("ran").unlink(missing_ok=True)
 
     forget()

@@ -11,13 +11,10 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import example
 from clpipe.engine.codegen import write_kernel
-from clpipe.engine.extents import whole_image
 from clpipe.engine.runner import Runner
-from clpipe.engine.tiles import buffer_sizes, halos_of, tiling_of
 from clpipe.images.read import read_image
 from clpipe.reference.resample import Resampling, lanczos3, overlap, resample
 from clpipe.stage import Kind
-from tests.test_tiles import same
 
 FILTERS = {"area": (overlap, 0.5), "lanczos3": (lanczos3, 3.0)}
 # Each size has noise by row and a stencil, so places on each of them count.
@@ -79,53 +76,6 @@ def test_lanczos3_is_that_of_pillow(scale):
     ours = resized(image, scale, "lanczos3")
     other = Image.fromarray(image).resize(ours.shape[::-1], Image.Resampling.LANCZOS)
     assert np.abs(ours - np.asarray(other)).max() < 2e-6
-
-
-@pytest.mark.parametrize("scales", [(0.5, 0.77), (0.9, 0.125), (1, 0.97)])
-def test_tiles_and_numpy_agree_on_every_size(device, monkeypatch, scales):
-    for method, size in zip(
-        ("area", "lanczos3", "area"), ((150, 203), (97, 140), (190, 9)), strict=True
-    ):
-        own = {"scale": scales[0], "method": method}, {"scale": scales[1]}
-        chain = make_chain(settings_from({**TWICE, "resize": own[0], "resize_2": own[1]}))
-        runner = Runner(chain, device, keep=("resize", "row_noise"), final=True)
-        image = example(Kind.RGB, size, half=True)
-        whole = runner.run(image, "k")
-        plain = Runner(chain, None, keep=runner.keep, final=True).run(image, "k")
-        assert whole.final.shape[1::-1] == chain.size(*image.shape[1::-1])
-        for one, two in (
-            (whole.final, plain.final),
-            *zip(whole.kept.values(), plain.kept.values(), strict=True),
-        ):
-            assert one.shape == two.shape
-            assert np.abs(one - two).max() < 1e-6
-        plan = runner.plan()
-        full = sum(buffer_sizes(plan, whole_image(plan, *size[::-1], device.info.lanes)).values())
-        with monkeypatch.context() as patch:
-            patch.setattr(device, "memory", full * 9 // 10)
-            same(whole, runner.run(image, "k"))
-            assert device.bytes_held <= full * 9 // 10
-
-
-@pytest.mark.parametrize("part", [2, 5, 12])
-@pytest.mark.parametrize("scale", [0.125, 0.4, 0.97])
-def test_tiles_cover_each_size_once_and_fit(scale, part):
-    methods = {"resize": {"scale": scale, "method": "lanczos3"}, "resize_2": {"scale": 0.6}}
-    plan = Runner(make_chain(settings_from({**TWICE, **methods})), None).plan()
-    assert halos_of(plan) == (0, 0, 1, 0, 0)
-    full = buffer_sizes(plan, whole_image(plan, 1403, 999, 8))
-    memory = sum(full.values()) // part
-    tiling = tiling_of(plan, 1403, 999, 8, memory, memory)
-    assert len(tiling.tiles) > 1 and tiling.bytes <= memory
-    covered = [np.zeros((e.height, e.width), int) for e in tiling.tiles[0]]
-    for extents in tiling.tiles:
-        sizes = buffer_sizes(plan, extents)
-        assert all(size <= tiling.sizes[name] for name, size in sizes.items())
-        for image, extent in zip(covered, extents, strict=True):
-            core, stored = extent.core, extent.stored
-            image[core.top : core.bottom, core.left : core.right] += 1
-            assert extent.is_empty or stored.left % 8 == stored.top % 4 == 0
-    assert all((image == 1).all() for image in covered)
 
 
 def test_kernels_do_not_depend_on_the_scale():

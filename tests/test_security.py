@@ -1,7 +1,6 @@
 """The promises of SECURITY.md, by number, or the names of their tests."""
 
 import json
-import os
 import re
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from tests.conftest import ROOT, reseal, run_python, written
 
 OWN_TEXT = Path(__file__).read_text("utf-8")
 NUMPY = ("--device", "numpy")
-CURVE = ("--set", "tone_curve.method=file", "--set", "tone_curve.path=curve.csv")
 
 # Where each promise is held besides here.
 ELSEWHERE = {
@@ -52,17 +50,10 @@ def test_1_no_data_runs_code(clpipe, render):
     Path("evil.toml").write_text('stage_files = ["evil.py"]\n')
     clpipe("run", render, "-o", "out", *NUMPY, "--keep", "normalize")
     values = json.loads(Path("out/in.json").read_text())
-
-    def replay(**changes):
-        edited = {**values, "request": {**values["request"], **changes}}
-        reseal(Path("edited.json"), edited)
-        clpipe("replay", "edited.json", "-o", "r", *NUMPY, status=(0, 2))
-
+    request = {**values["request"], "options": {"camera": "evil.toml"}}
+    reseal(Path("edited.json"), {**values, "request": request})
+    clpipe("replay", "edited.json", "-o", "r", *NUMPY, status=2)
     named = {"stage_files": ["evil.py"]}
-    replay(stage_files=["evil.py"], files={})
-    for place in ("config", "options", "image"):
-        replay(**{place: named})
-    replay(options={"camera": "evil.toml"})
     Path("in.jsonl").write_text(json.dumps({"path": "in.exr", **named}))
     clpipe("run", "in.jsonl", "-o", "m", *NUMPY, status=2)
     Path("in.jsonl").write_text(json.dumps({"path": "in.exr", "camera": "evil.toml"}))
@@ -109,38 +100,6 @@ def test_3_no_link_is_written_through(clpipe, render):
     Path("trace.json").symlink_to("victim")
     clpipe("run", render, "-o", "t", "--trace", "trace.json", *NUMPY, status=2)
     assert Path("victim").read_text() == "keep"
-
-
-@pytest.mark.parametrize("device", ["/dev/zero", "pipe"])
-def test_4_what_never_ends_is_not_read(clpipe, render, device):
-    os.mkfifo("pipe")
-    clpipe("run", render, "-o", "out", *NUMPY)
-    values = json.loads(Path("out/in.json").read_text())
-    values["request"]["files"][str(Path(device).resolve())] = "0" * 64
-    reseal(Path("e.json"), values)
-    for name in ("c.toml", "m.jsonl", "s.json", "x.exr", "x.dng", "x.png", "curve.csv"):
-        Path(name).symlink_to(device)
-    for arguments in (
-        ("run", "x.exr", "-o", "o"),
-        ("run", "x.dng", "-o", "o"),
-        ("run", "x.png", "-o", "o", "--transfer", "srgb"),
-        ("run", "m.jsonl", "-o", "o"),
-        ("run", "in.exr", "-o", "o", "-c", "c.toml"),
-        ("run", "in.exr", "-o", "o", "--camera", "c.toml"),
-        ("run", "in.exr", "-o", "o", *CURVE),
-        ("replay", "s.json", "-o", "o"),
-        ("replay", "e.json", "-o", "o"),
-    ):
-        clpipe(*arguments, *NUMPY, status=(1, 2))
-
-
-def test_6_a_batch_goes_on_and_the_terminal_is_safe(clpipe, render):
-    Path("in").mkdir()
-    Path("in/good.exr").write_bytes(Path(render).read_bytes())
-    Path("in/\x1b[2Jbad\n.exr").write_bytes(b"v/1\x01")
-    output = clpipe("run", "in", "-o", "out", *NUMPY, status=1).output
-    assert "\x1b" not in output and "bad" in output
-    assert Path("out/good.jpg").exists()
 
 
 @pytest.mark.slow

@@ -191,25 +191,6 @@ def test_hot_pixels_can_be_seen_where_the_camera_does_not_say_how_hot(develop):
     assert (image >= 0.1).mean() == pytest.approx(0.01, rel=0.2)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"chi": 100.0}, "sensor_noise: .*need both chi and theta; only chi is set"),
-        ({"chi": 1e3, "theta": 1.0, "system_gain": 2.0}, "use only one of these parametrisations"),
-        (
-            {"a": 1e-3, "system_gain": 2.0},
-            "sensor_noise: set the noise in one parametrisation; a",
-        ),
-        ({"chi": 1e3, "theta": 1.0, "p0": 0.1}, "sensor_noise: p0 = 0.1 makes b negative"),
-        ({"method": "poisson", "a": 0.0}, "poisson needs the parameter a above 0"),
-        ({"tukey_lambda": -0.5}, "tukey_lambda"),
-    ],
-)
-def test_noise_that_cannot_be_is_refused(given, message):
-    with pytest.raises(RequestError, match=message):
-        make_chain(settings_from({"sensor_noise": given}))
-
-
 def fixed(develop, key="k", seed=0, iso=3200, level=0.0, **stages):
     flat = np.full((400, 600), level, np.float32)
     return develop(flat, key, source=Kind.MOSAIC, stages=list(stages), seed=seed, iso=iso, **stages)

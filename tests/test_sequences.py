@@ -10,17 +10,14 @@ import OpenEXR
 import pytest
 
 import clpipe
-from clpipe.base.errors import DeviceFailedError, RequestError
+from clpipe.base.errors import RequestError
 from clpipe.base.memory import FreeMemory
-from clpipe.batch import memory_budget, metering, threads
-from clpipe.batch.memory_budget import MemoryBudget
+from clpipe.batch import memory_budget, threads
 from clpipe.camera.control import AutoIso, Control, ControlLoop
 from clpipe.chain.drawing import draw_values
 from clpipe.chain.draws import Drift
 from clpipe.chain.files import load_settings
 from clpipe.chain.limits import Limits
-from clpipe.engine.device import Device, open_devices
-from clpipe.engine.runner import Runner
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.manifest import read_manifest
@@ -246,22 +243,13 @@ def test_a_frame_that_cannot_be_read_fails_alone(frames, tmp_path):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """The keys of the images that were read, in order; each is checked to have memory."""
-    found, budgets, read = [], [], ImageLoader.read
-
-    def budget(*arguments):
-        budgets.append(MemoryBudget(*arguments))
-        return budgets[-1]
+    """The keys of the images that were read, in order."""
+    found, read = [], ImageLoader.read
 
     def reading(self, job):
-        taken = budgets[-1]._taken.values()
-        assert taken
-        assert sum(taken) <= budgets[-1]._size or len(taken) == 1
         found.append(job.key)
         return read(self, job)
 
-    monkeypatch.setattr(threads, "MemoryBudget", budget)
-    monkeypatch.setattr(metering, "MemoryBudget", budget)
     monkeypatch.setattr(ImageLoader, "read", reading)
     return found
 
@@ -288,20 +276,6 @@ def test_each_frame_is_decoded_once(frames, reads, tmp_path, monkeypatch, budget
     again = keys[:6] if has_state else []
     assert statuses.count("done") == (9 if has_state else 1)
     assert sorted(reads) == sorted([*keys, *again])
-
-
-def test_frames_are_metered_by_the_devices_of_the_run(frames, tmp_path, monkeypatch):
-    opened, init = [], Device.__init__
-
-    def counted(self, *arguments):
-        opened.append(self)
-        init(self, *arguments)
-
-    monkeypatch.setattr(Device, "__init__", counted)
-    assert {
-        o.status for o in clpipe.run(tmp_path / "frames", tmp_path / "out", sequence=True, **LOOPS)
-    } == {"done"}
-    assert len(opened) == len(open_devices())
 
 
 def test_a_frame_that_no_memory_suffices_for_fails_alone(
@@ -341,22 +315,11 @@ def black(tmp_path, write_exr, monkeypatch):
     write_exr("frames/a/4.exr", np.zeros((24, 32, 3)))
 
 
-def unmetered(tmp_path, write_exr, monkeypatch):
-    run_ = Runner.run
-
-    def failing(self, image, noise_key, options):
-        if noise_key.startswith("a/4.exr") and options.boxes:
-            raise DeviceFailedError("it failed")
-        return run_(self, image, noise_key, options)
-
-    monkeypatch.setattr(Runner, "run", failing)
-
-
 def unreadable(tmp_path, write_exr, monkeypatch):
     (tmp_path / "frames/a/4.exr").write_bytes(b"no picture")
 
 
-@pytest.mark.parametrize("fault", [black, unmetered, unreadable])
+@pytest.mark.parametrize("fault", [black, unreadable])
 def test_a_frame_that_cannot_be_metered_holds_the_loops(
     frames, tmp_path, write_exr, monkeypatch, fault
 ):
@@ -443,29 +406,21 @@ def test_a_key_stays_in_the_output_directory(tmp_path):
         clpipe.run(tmp_path / "a.csv", tmp_path / "out")
 
 
-def sequences_of(*names):
-    placed = in_sequences([Job(Path(name), name) for name in names])
-    found = {}
-    for job in placed:
-        found.setdefault(job.place.key, []).append((job.key, job.place.index))
-    return found
-
-
 def test_the_number_of_a_frame_is_not_that_of_a_camera_or_a_version():
     rig = [f"cam{camera}_f{frame}.exr" for camera in range(5) for frame in (1, 2, 3)]
-    found = sequences_of(*rig)
+    found = placed(*rig)
     assert len(found) == 5 and all(len(frames) == 3 for frames in found.values())
     versions = [f"shot_v{version}_{frame}.exr" for version in (1, 2, 10, 11) for frame in (1, 2)]
-    assert [len(frames) for frames in sequences_of(*versions).values()] == [2] * 4
+    assert [len(frames) for frames in placed(*versions).values()] == [2] * 4
     first = [f"frame_{frame:04}_cam{camera}.exr" for frame in (1, 2, 3) for camera in range(5)]
-    assert [len(frames) for frames in sequences_of(*first).values()] == [3] * 5
+    assert [len(frames) for frames in placed(*first).values()] == [3] * 5
     padded = [f"left{eye}.{frame:04}.exr" for eye in (0, 1) for frame in (9, 10)]
-    assert [len(frames) for frames in sequences_of(*padded).values()] == [2] * 2
+    assert [len(frames) for frames in placed(*padded).values()] == [2] * 2
 
 
 def test_numbers_of_frames_have_decimals():
     names = [f"f.{number}.exr" for number in ("1.25", "1.5", "1.75", "2.0")]
-    [frames] = sequences_of(*names).values()
+    [frames] = placed(*names).values()
     assert frames == list(zip(names, range(4), strict=True))
 
 
@@ -480,7 +435,7 @@ def test_numbers_of_frames_have_decimals():
 def test_time_stamps_are_times(stamps):
     """Intervals of 36 and 32 ms, whose mean is the unit."""
     names = [f"{stamp}.exr" for stamp in stamps]
-    [frames] = sequences_of(*names[::-1]).values()
+    [frames] = placed(*names[::-1]).values()
     assert [name for name, _ in frames] == names
     assert [place for _, place in frames] == pytest.approx([0, 36 / 34, 2], abs=2e-3)
 
@@ -501,7 +456,7 @@ def test_numbers_that_are_dates_are_no_time_stamps():
 
 
 def test_a_large_gap_is_no_time_stamp(caplog):
-    [frames] = sequences_of("f.1.exr", "f.2.exr", "f.3.exr", "f.1000.exr").values()
+    [frames] = placed("f.1.exr", "f.2.exr", "f.3.exr", "f.1000.exr").values()
     assert frames[-1] == ("f.1000.exr", 999)
     assert "996 of 1000 frames are missing: 4 to 999" in caplog.text
 

@@ -52,25 +52,6 @@ def test_several_of_one_alone_name_no_folder_for_the_other(clpipe, renders, tmp_
     assert names[1] == ["canon-5d2/iso1600/a.jpg", "canon-5d2/iso1600/a.json"]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--iso", "100,x"], "--iso: found '100,x'; expected numbers above 0"),
-        (
-            ["--iso", "100,-5"],
-            "expected numbers above 0 with commas between them, such as 100,800,3200",
-        ),
-        (["--iso", "100,1e2"], "--iso: found '100,1e2', which lists 100 twice; list it once"),
-        (["--iso", "9", "--set", "iso.choice=[9]"], "--set iso.choice=[9]: found --iso as well"),
-        (["--iso", "100,1e7"], "found 1e+07, but camera sony-a7r2 goes from 100 to 25600"),
-        (["--camera", "sony-a7r2", "--camera", "ILCE-7RM2"], "sony-a7r2 is listed twice"),
-        (["--camera", "sony-a7r2", "--camera", "nikon-f"], "nikon-f"),
-    ],
-)
-def test_rejected_options(clpipe, renders, options, message):
-    assert message in clpipe("run", "renders", "-o", "out", *NUMPY, *options, status=2).stderr
-
-
 def test_a_manifest_that_says_it_too_is_refused(clpipe, renders, tmp_path):
     (tmp_path / "rows.csv").write_text("path,iso\nrenders/a.exr,400\n")
     stderr = clpipe("run", "rows.csv", "-o", "out", *NUMPY, "--iso", "100,200", status=2).stderr

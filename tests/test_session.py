@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import clpipe as package
-from clpipe.base.errors import RequestError
 from clpipe.batch.run_log import read_log
 from tests.conftest import contents, written
 
@@ -41,38 +40,6 @@ def test_nothing_is_written_before_a_run_is_iterated(renders):
     assert len(made.jobs) == 3 and not Path("out").exists()
     list(made)
     assert "a.jpg" in written(Path("out"))
-
-
-def test_impossible_requests_are_rejected_at_once(renders):
-    for options, message in (
-        ({"iso": [100, 100]}, r"^iso: found \[100, 100\], which lists 100 twice"),
-        ({"truth": "cleen"}, r"unknown truth 'cleen' \(did you mean 'clean'"),
-        ({"patch": 0}, "found patch 0; expected a whole number from 1"),
-        ({"patch": package.Patches(8, 10**4)}, "found patches_per_image 10000; expected a whole"),
-        ({"frames": 0}, "found frames 0; expected a whole number from 1 to 100000"),
-        ({"frames": 10**9}, "found frames 1000000000; expected a whole number from 1 to 100000"),
-        ({"jobs": -1}, "found jobs -1; expected a whole number from 1 to 1024"),
-        ({"webdataset": 0}, "found webdataset 0; expected a whole number from 1 to"),
-        ({"max_pixels": 0}, "found max_pixels 0; expected a whole number from 1 to"),
-        ({"memory": 0}, "^memory: '0' is not a size"),
-        ({"format": "gif"}, "unknown format 'gif'"),
-        ({"transfer": "x"}, "found transfer 'x'; expected 'srgb', 'linear' or None"),
-        ({"bracket": [1, 1]}, r"^bracket: found \[1, 1\], which repeats \+1 EV"),
-        ({"bracket": [float("nan")]}, r"^bracket: found \[nan\]; expected EVs"),
-        ({"redo": "some"}, "found redo 'some'"),
-        ({"frames": "2"}, "found frames '2'; expected a whole number or None"),
-        (
-            {"layer": "a", "stages": ["normalize", "demosaic"], "start_at": "normalize"},
-            "^layer: this option is only for renders",
-        ),
-        ({"nosuch": 1}, "nosuch"),
-    ):
-        with pytest.raises(RequestError, match=message):
-            package.run("in", "out", **{**DEVICE, **options})
-    with pytest.raises(RequestError, match="output: found an empty path; name a directory"):
-        package.run("in", "", **DEVICE)
-    with pytest.raises(RequestError, match="the name of a picture"):
-        package.run("in", "out.jpg", **DEVICE)
 
 
 def test_a_run_that_is_left_finishes_what_is_in_flight(renders):

@@ -14,7 +14,6 @@ import clpipe as package
 from clpipe.base.errors import RequestError
 from clpipe.batch.execution import parse_failures
 from clpipe.batch.run_log import read_log
-from clpipe.commands import progress
 from clpipe.reports.status import read_status
 from tests.buckets import MemoryBucket
 from tests.conftest import contents, written
@@ -241,13 +240,6 @@ def test_metrics(renders, clpipe):
     assert {name for name, _ in found} == set(names)
     stderr = clpipe("run", "in", "-o", "o", *RUN, "--metrics", "none/m.prom", status=1).stderr
     assert "--metrics: " in stderr and "5 of 6 images done" in stderr
-
-
-def test_lines_at_intervals_without_a_terminal(renders, clpipe, monkeypatch):
-    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.001)
-    stderr = clpipe("run", "in", "-o", "o", *RUN, "--metrics", "m.prom").stderr
-    assert re.search(r"\d of 6 images; ", stderr)
-    assert "left" not in clpipe("run", "in", "-o", "p", *RUN, "--quiet").stderr
 
 
 def test_a_status_from_python_reads_no_pictures(renders, clpipe):

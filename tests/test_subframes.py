@@ -118,20 +118,6 @@ def test_a_dataset_and_a_manifest_group_frames_too(frames, write_exr):
     assert len(Dataset("list.csv", shutter={"subframes": 4}, device="numpy")) == 2
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("shutter.subframes=3",), "in: shutter.subframes is 3, but this folder has 8 images"),
-        (("shutter.subframes={choice=[2, 4]}",), "shutter.subframes: found a random draw"),
-        (("shutter.subframes=0",), "shutter.subframes"),
-    ],
-)
-def test_what_cannot_be_grouped(frames, clpipe, options, message):
-    sets = [x for option in options for x in ("--set", option)]
-    assert message in clpipe("run", "in", "-o", "o", *sets, status=2).stderr
-    assert not Path("o").exists()
-
-
 def test_rows_that_differ_are_no_exposure(frames, clpipe):
     Path("list.csv").write_text("path,iso\nin/f00.exr,100\nin/f01.exr,200\n")
     again = clpipe("run", "list.csv", "-o", "o", "--set", "shutter.subframes=2", status=2)

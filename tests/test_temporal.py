@@ -1,7 +1,5 @@
 """Denoising over time: a stage with state, on frames of a sequence."""
 
-from dataclasses import replace
-
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -11,13 +9,11 @@ from clpipe.base.errors import DeviceFailedError, ImageError
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.device import Device
-from clpipe.engine.extents import Box
 from clpipe.engine.ir import Launch
 from clpipe.engine.ops import FrameKind
 from clpipe.engine.options import RunOptions
 from clpipe.engine.plan import make_plan
 from clpipe.engine.runner import Runner
-from clpipe.engine.service import Frame, Service
 from clpipe.engine.state import State
 from clpipe.reference.image import tap
 from clpipe.stages import DEFAULT_CHAIN
@@ -51,50 +47,6 @@ def moving(size, count=3):
     for number, frame in enumerate(frames):
         frame[:, : size[1] // 2] = np.roll(frame[:, : size[1] // 2], number, axis=1)
     return [frame.astype(np.float32) for frame in frames]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_kernel_and_numpy_agree_on_every_frame(device, method):
-    chain = chain_of(method=method)
-    for size in ((1, 9), (2, 3), (37, 53)):
-        frames = moving(size)
-        on_device, in_numpy = (
-            results(Runner(chain, each, encode=False, final=True), frames)
-            for each in (device, None)
-        )
-        for one, two in zip(on_device, in_numpy, strict=True):
-            np.testing.assert_array_equal(one.final, two.final)
-    assert not np.array_equal(on_device[1].final, frames[1])
-
-
-@pytest.mark.parametrize("changes", [{"lanes": 1}, {"type": "GPU"}])
-def test_devices_with_one_lane_or_their_own_memory_give_the_same_bits(device, changes):
-    other = Device(replace(device.info, **changes))
-    chain, frames = chain_of(method="block_matching"), moving((37, 53), 5)
-    expected = results(Runner(chain, device, encode=False, final=True), frames)
-    options = RunOptions(state=State())
-    wanted = [Frame(chain, each, "", encode=False, final=True, options=options) for each in frames]
-    service = Service([other])
-    developments = [each for frame in wanted for each in service.develop([frame])]  # in flight
-    for development, result in zip(developments, expected, strict=True):
-        np.testing.assert_array_equal(development.result().final, result.final)
-
-
-def test_bands_kept_images_and_patches_give_the_same_bits(device):
-    frames = [np.full((61, 83, 3), 0.2, np.float16)] * 3
-    chain = chain_of(LONG)
-    expected = results(Runner(chain, device, final=True), frames)[-1]
-    apart = results(Runner(chain, device, final=True, bands=False), frames)[-1]
-    np.testing.assert_array_equal(apart.final, expected.final)
-    kept = results(Runner(chain, device, (STAGE, "denoise"), final=True), frames)[-1]
-    np.testing.assert_array_equal(kept.final, expected.final)
-    until = Runner(make_chain(chain.settings, until=STAGE), device, encode=False, final=True)
-    np.testing.assert_array_equal(results(until, frames)[-1].final, kept.kept[STAGE])
-    boxes = [Box(3, 5, 19, 13), Box(40, 50, 56, 58)]
-    patches = results(Runner(chain, device, final=True), frames, boxes=boxes)[-1]
-    for patch, box in zip(patches.final, boxes, strict=True):
-        part = expected.final[box.top : box.bottom, box.left : box.right]
-        np.testing.assert_array_equal(patch, part)
 
 
 def test_single_images_and_first_frames_do_not_change(device):

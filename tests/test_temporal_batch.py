@@ -2,7 +2,6 @@
 
 import threading
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -10,8 +9,6 @@ import pytest
 
 import clpipe
 from clpipe.base.errors import RequestError
-from clpipe.batch.frames import Turns
-from clpipe.inputs.find import Job, Place
 from clpipe.inputs.loader import ImageLoader
 from tests.conftest import cli_output, contents
 
@@ -75,14 +72,6 @@ def test_noise_falls_from_frame_to_frame_in_each_sequence(frames):
         assert all(later < 1.03 * earlier for earlier, later in pairwise(noise))
 
 
-def test_numpy_and_the_device_agree(frames):
-    run(frames, "device", jobs=1)
-    run(frames, "numpy", device="numpy")
-    for name in pictures(frames / "numpy"):
-        one, two = (pixels(frames / out / name) for out in ("device", "numpy"))
-        assert np.abs(one - two).max() <= 1.5 / 255
-
-
 def test_a_missing_frame_recomputes_its_sequence_and_no_other(frames):
     run(frames, "out")
     first = pictures(frames / "out")
@@ -141,31 +130,3 @@ def test_several_processes_are_rejected_and_single_images_warn(frames, caplog):
         run(frames, "out", dask="tcp://localhost:1")
     run(frames, "out", sequence=False)
     assert "temporal_denoise changes only frames of sequences; add sequence" in caplog.text
-
-
-def test_turns_are_taken_in_order_and_end_with_the_run():
-    turns = Turns()
-    jobs = [Job(Path(f"{n}.exr"), f"{n}.exr", place=Place("s", "s", n, 3)) for n in range(3)]
-    for job in jobs:
-        turns.expect(job)
-    assert turns.wait(jobs[0])
-    assert turns.wait(Job(Path("x.exr"), "x.exr"))  # it belongs to no sequence
-    order = []
-
-    def pass_by(number):
-        if turns.wait(jobs[number]):
-            order.append(number)
-        turns.end(jobs[number])
-
-    threads = [threading.Thread(target=pass_by, args=(n,)) for n in (2, 1)]
-    for thread in threads:
-        thread.start()
-    turns.end(jobs[0])
-    for thread in threads:
-        thread.join(WAIT)
-    assert order == [1, 2]
-    late = Job(Path("4.exr"), "4.exr", place=Place("s", "s", 4, 6))
-    for n in (3, 4):
-        turns.expect(Job(Path(f"{n}.exr"), f"{n}.exr", place=Place("s", "s", n, 6)))
-    turns.close()
-    assert not turns.wait(late)

@@ -1,7 +1,6 @@
 """Denoising over time along an optical flow: from arrays, and from the layers of renders."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import OpenEXR
@@ -12,7 +11,6 @@ from clpipe.base.errors import ImageError
 from clpipe.chain.layers import layer_of, layer_of_array, with_layers
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
-from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.state import State
@@ -59,17 +57,6 @@ def test_the_kernel_is_the_reference(device, scalar_device):
     assert not np.array_equal(expected[1], frames[1])
     other = along(chain, frames, [np.zeros_like(flow) for flow in flows], None)
     assert not np.array_equal(other[1], expected[1])
-
-
-def test_bands_lanes_and_memory_do_not_change_a_bit(device):
-    frames = [np.random.default_rng(n).random((61, 83, 3), np.float32) * 0.3 for n in range(2)]
-    flows = [fractional((61, 83), seed) for seed in range(2)]
-    stages = {"iso": 3200, "stages": LONG, STAGE: {"method": "flow", "threshold": 100.0}}
-    chain = make_chain(settings_from({**stages, "sharpen": {"amount": 1.0}}))
-    expected = along(chain, frames, flows, device)[-1]
-    np.testing.assert_array_equal(along(chain, frames, flows, device, bands=False)[-1], expected)
-    apart = Device(replace(device.info, type="GPU"))
-    np.testing.assert_array_equal(along(chain, frames, flows, apart)[-1], expected)
 
 
 def test_whole_steps_move_pixels_exactly_and_others_between_them():

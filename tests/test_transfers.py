@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 from collections import Counter
 from pathlib import Path
 from typing import ClassVar
@@ -16,11 +15,7 @@ import clpipe as package
 from clpipe.base import transfers, urls
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.transfers import TRANSFERS, class_of
-from clpipe.batch import downloads
-from clpipe.batch.job_state import JobState
-from clpipe.inputs.find import Job
 from tests.buckets import MemoryBucket
-from tests.conftest import written
 
 RUN = ("--iso", 3200, "--device", "numpy", "--skip", "noise")
 
@@ -203,18 +198,6 @@ def test_a_stall_without_end_is_an_error(bucket, monkeypatch):
     go.set()
 
 
-def test_large_files_have_more_time(bucket, monkeypatch):
-    monkeypatch.setattr(transfers, "TRY_SECONDS", 0.0)
-    monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: time.sleep(0.3)))
-    size = Path("in/r0.exr").stat().st_size
-    monkeypatch.setattr(transfers, "MIN_SPEED", size / 60)
-    urls.upload(Path("in/r0.exr"), "faulty://b/x")
-    assert bucket.cat_file("/b/x") == Path("in/r0.exr").read_bytes()
-    with urls.fetched_files([urls.path_of("faulty://b/x")]) as (path,):
-        assert path.read_bytes() == Path("in/r0.exr").read_bytes()
-    assert not path.exists()
-
-
 @pytest.mark.parametrize("kind", ["stalls", "fails"])
 def test_nothing_is_retried_after_a_stop(bucket, clpipe, monkeypatch, kind):
     """Images whose files did not arrive are left to the next run."""
@@ -261,40 +244,6 @@ def test_a_stop_in_python_ends_transfers(bucket, monkeypatch):
     assert run.summary.interrupted and not run.summary.failures
     monkeypatch.setattr(Faulty, "fault", staticmethod(lambda path: None))
     assert {each.status for each in package.run("faulty://b/in", "o")} <= {"done", "skipped"}
-
-
-def test_files_are_fetched_before_a_thread_takes_them(bucket, clpipe, monkeypatch):
-    together = threading.Barrier(2, timeout=60)
-
-    def fault(path):
-        if path[-6:] in ("r1.exr", "r2.exr"):
-            together.wait()
-
-    monkeypatch.setattr(transfers, "MAX_TRIES", 1)
-    monkeypatch.setattr(Faulty, "fault", staticmethod(fault))
-    stderr = clpipe("run", "faulty://b/in", "-o", "o", *RUN, "--jobs", 1).stderr
-    assert "6 of 6 images done, 0 failed" in stderr and "fetch" in stderr
-    assert all(line["fetch_seconds"] > 0 for line in images().values())
-    clpipe("run", "in", "-o", "whole", *RUN)
-    names = [name for name in written(Path("o")) if name.endswith(".jpg")]
-    assert len(names) == 6
-    for name in names:
-        assert Path("o", name).read_bytes() == Path("whole", name).read_bytes()
-    assert images("whole")["r0.exr"]["fetch_seconds"] == 0
-
-
-@pytest.mark.parametrize(("largest", "ahead"), [(1, 16), (100 << 20, 2), (1 << 30, 1)])
-def test_large_files_are_not_all_fetched_at_once(bucket, largest, ahead):
-    begun = []
-    found = downloads.Downloads(lambda job: begun.append(job.key) or JobState(job, None, job))
-    found._largest = largest
-    jobs: downloads.Jobs = downloads.queue.SimpleQueue()
-    for number in range(40):
-        jobs.put(Job(urls.path_of(f"faulty://b/{number}.exr"), f"{number}.exr"))
-    first = found.take(jobs, is_waiting=True)
-    assert first.key == "0.exr"
-    found.close()
-    assert jobs.qsize() == 39 - ahead and set(begun) <= {f"{n}.exr" for n in range(1, ahead + 1)}
 
 
 FILE = {"type": "file", "size": 0}

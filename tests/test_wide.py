@@ -23,7 +23,7 @@ from clpipe.reference.panorama import (
 )
 from clpipe.reference.projection import visible_faces
 from clpipe.reference.wide import WideLens
-from tests.test_tiles import in_tiles
+from tests.test_cuts import in_tiles
 
 SIDE = 96
 LENSES = {
@@ -135,13 +135,13 @@ def test_a_wide_picture_is_where_the_scene_is(device, kind, model):
 
 
 @pytest.mark.slow
-def test_tiles_have_the_same_bits(device, monkeypatch):
+def test_tiles_have_the_same_bits(device):
     panorama = PANORAMAS["cube"]
     chain = make_chain(settings_from(settings_of("unified", fx=240.0, fy=240.0)))
     chain = with_panorama(chain, panorama)
     atlas = panorama.atlas(images_of(panorama), "bicubic")
     runner = Runner(chain, device, encode=False, final=True)
-    assert in_tiles(runner, atlas, 160, 120, monkeypatch)[1] >= 2
+    assert in_tiles(runner, atlas, 160, 120)[1] >= 2
 
 
 def opencv(rays, fx, fy, cx, cy, k):

@@ -221,15 +221,16 @@ def make_plan(
     last = chain.steps[-1].name
     final = final or last in keep
     planner = _Planner(chain.source, fold)
-    periods = border_periods(chain)
+    planner.period, *later_periods = border_periods(chain).values()
     kept: dict[str, Image] = {}
     states: list[tuple[str, Image | None, Image]] = []
     arguments = chain.arguments
     later = chain_ops(chain, arguments, FrameKind.LATER)
     with_state = {name for name, ops in later if any(op.has_state for op in ops)}
-    for name, ops in chain_ops(chain, arguments, frame):
-        planner.period = periods[name]
+    steps = chain_ops(chain, arguments, frame)
+    for (name, ops), period in zip(steps, [*later_periods, None], strict=True):
         planner.add_step(ops)
+        planner.period = period
         if name in with_state and frame is not FrameKind.SINGLE:
             states.append((name, planner.previous.get(name), planner.keep()))
         if name in keep and name != last:

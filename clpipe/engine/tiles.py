@@ -175,7 +175,7 @@ class Cutter:
 
     def __init__(self, plan: Plan, width: int, height: int, lanes: int) -> None:
         self.whole = whole_image(plan, width, height, lanes)
-        columns = (columns_of(x, lanes) for x in plan.launches)
+        columns = (columns_of(launch, lanes) for launch in plan.alone)
         self.column_step = lanes * math.lcm(2, *columns)
         self._halos = halos_of(plan)
         self._resamplings = plan.resamplings
