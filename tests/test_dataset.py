@@ -135,6 +135,7 @@ def test_only_a_few_are_ahead(renders):
     with pytest.raises(ImageError, match=r"s08\.exr"):
         list(samples)
     del samples
+    gc.collect()  # of the error that holds the data set
     for thread in {*threading.enumerate()} - before:
         thread.join(1)  # one that would have announced slow compiling may still be ending
         assert not thread.is_alive()
