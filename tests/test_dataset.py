@@ -300,6 +300,17 @@ def test_a_render_that_cannot_be_written_does_not_count():
     assert kept.get("a", lambda: image).pixels.flags.writeable is False  # mapped now
 
 
+@pytest.mark.parametrize(("ending", "size"), [(".npy", 100), (".npy", 3), (".pickle", 20)])
+def test_a_kept_image_that_a_full_disk_cut_off_is_decoded_again(ending, size):
+    image = SourceImage(np.ones((64, 64, 3), np.float16), "", "", (), {})
+    kept = RenderCache(10**6)
+    kept.get("a", lambda: image)
+    (path,) = kept._folder.glob(f"*{ending}")
+    path.write_bytes(path.read_bytes()[:size])
+    worker = pickle.loads(pickle.dumps(kept))  # it has not opened the file
+    assert np.array_equal(worker.get("a", lambda: image).pixels, image.pixels)
+
+
 KILLED = """
 import os, signal, clpipe
 data = clpipe.StreamingDataset("a.tar", device="numpy", stages=["exposure"])

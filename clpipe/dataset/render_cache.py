@@ -125,8 +125,8 @@ def _open_mapped(path: Path) -> SourceImage | None:
         with path.with_suffix(".pickle").open("rb") as file:
             source, planar = pickle.load(file)  # noqa: S301  # written by this user
         pixels = np.asarray(np.load(path.with_suffix(".npy"), mmap_mode="r"))
-    except OSError:
-        return None
+    except (OSError, ValueError, EOFError, pickle.UnpicklingError):
+        return None  # missing, or cut off because the disk was full
     return replace(source, pixels=pixels.transpose(1, 2, 0) if planar else pixels)
 
 
