@@ -168,7 +168,7 @@ from clpipe.batch.work import ImageWorker
 def broken(self, device):
     import time; time.sleep(0.3)
     raise DeviceError("a kernel does not compile")
-ImageWorker.runners = broken
+ImageWorker.compile = broken
 """
 
 

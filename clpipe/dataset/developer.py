@@ -128,6 +128,7 @@ class DevelopTask:
     Args:
         spec: the contents of samples.
         chain: the chain of the image.
+        source: the image. It holds the layers that steps read, which chains do not.
         patches: the patches that are samples. () is one sample of the whole picture.
         frames: the frames to develop, by name.
         carried: the layers of the image, by name.
@@ -136,6 +137,7 @@ class DevelopTask:
 
     spec: SampleSpec
     chain: Chain
+    source: SourceImage
     patches: Sequence[Patch]
     frames: Mapping[str, Frame]
     carried: Sample

@@ -184,9 +184,8 @@ class SampleLoader:
             frames = self._spec.frames(chain, source, key, patches)
         except (ImageError, RequestError, MemoryError) as error:
             return ImageError(self._loader.error_text(job, error))
-        return DevelopTask(
-            self._spec, chain, patches, frames, carried, self._metadata(batch, loaded)
-        )
+        facts = self._metadata(batch, loaded)
+        return DevelopTask(self._spec, chain, source, patches, frames, carried, facts)
 
     def _finish(
         self, batch: SampleBatch, task: DevelopTask, pending: Mapping[str, Development]
