@@ -1,6 +1,6 @@
 """Compare the speed of clpipe's default chain with the same work in OpenCV and NumPy.
 
-    tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...] [--methods]
+    tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...]
 
 It needs the extra "compare" (.venv/bin/pip install -e '.[compare]'). opencv_chain.py lists
 the OpenCV functions that replace each stage, and where OpenCV does less work. The OpenCV script
@@ -17,8 +17,6 @@ script decodes with the OpenEXR package, which is at least as fast as cv2.imread
 cv2.imencode, which is faster than Pillow. It uses the fastest of several numbers of threads. Links
 to a few renders replace many files.
 
-Methods: see methods.py for the comparison with colour-demosaicing, scikit-image and HDRutils.
-
 A round runs each candidate once, so that other load on the machine affects all of them. Speeds are
 medians. Ratios are computed within rounds; the tables show their median and quartiles. First, both
 programs develop the test image, and the script compares their pictures and noise.
@@ -26,7 +24,6 @@ programs develop the test image, and the script compares their pictures and nois
 
 import argparse
 import importlib.util
-import json
 import shutil
 import sys
 import tempfile
@@ -242,13 +239,6 @@ def load_of(text: str) -> Workload:
     return Workload(*numbers_of(text, 3))
 
 
-def rounds_of(text: str) -> int:
-    """Parse a number of rounds, at least one."""
-    if not text.isdecimal() or not int(text):
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number from 1 on")
-    return int(text)
-
-
 def numbers_of(text: str, count: int) -> list[int]:
     """Parse whole numbers separated by x; widths and heights must be even.
 
@@ -288,8 +278,6 @@ def main() -> int:
     parser.add_argument(
         "--repeat", type=int, default=5, metavar="N", help="rounds of each comparison"
     )
-    parser.add_argument("--methods", action="store_true", help="compare single methods as well")
-    parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
         print(
@@ -319,22 +307,6 @@ def compare(options: argparse.Namespace) -> int:
     for size in options.arrays:
         rows += compare_arrays(device, *size, options.repeat)
     rows += [compare_files(device, workload, options.repeat) for workload in options.files]
-    methods = []
-    if options.methods:
-        from tools.compare.methods import compare_methods
-
-        methods = compare_methods(device, options.repeat)
-    record = {
-        "device": device.info.label,
-        "opencv": cv2.__version__,
-        "processors": available_processors(),
-        "likeness": alike._asdict(),
-        "chain": [row.record() for row in rows],
-        "methods": [row.record() for row in methods],
-    }
-    if options.json:
-        print(json.dumps(record, indent=2))
-        return 0
     print(
         f"{device.info.label}, OpenCV {cv2.__version__}, {available_processors()} CPUs\n"
         f"pictures of the test image differ by {alike.difference:.1f} levels of 255 on average; "
@@ -342,13 +314,6 @@ def compare(options: argparse.Namespace) -> int:
     )
     if rows:
         show(HEADINGS, [row.cells() for row in rows], left=1)
-    if methods:
-        print()
-        show(
-            ("method", "clpipe MP/s", "other MP/s", "ratio", "quartiles"),
-            [row.cells() for row in methods],
-            left=1,
-        )
     return 0
 
 
