@@ -77,15 +77,6 @@ def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> Col
     )
 
 
-def delta_e(one: NDArray[np.number], two: NDArray[np.number]) -> Doubles:
-    """Return the distance of colours in CIELAB (CIE 1976), pixel by pixel.
-
-    >>> delta_e(np.array([255, 0, 0]), np.array([0, 255, 0])).round(1).tolist()
-    170.6
-    """
-    return np.linalg.norm(cielab(one) - cielab(two), axis=-1)
-
-
 def dots(picture: NDArray[np.number], reference: NDArray[np.number]) -> float:
     """Return the number of isolated pixels per 10,000 that the reference lacks.
 

@@ -54,6 +54,8 @@ from tools.compare.classifier import (
     over_white,
     statistics,
 )
+from tools.shared.options import parser_of
+from tools.shared.pairs import find_pairs
 
 FEWEST = 4  # patches of a camera
 COVERED = 0.6  # lowest share of a patch that is flat, and neither dark nor bright
@@ -81,17 +83,10 @@ def read_pairs(folder: Path) -> list[Pair]:
     Raises:
         SystemExit: the folder has no pair, or a picture has no mean.
     """
-    found = []
-    for real in sorted(folder.glob("*_real.png")):
-        name = real.name.removesuffix("_real.png")
-        mean = real.with_name(f"{name}_mean.png")
-        if not mean.exists():
-            raise SystemExit(f"{real} has no {mean.name} next to it")
-        scenes = load_scenes([str(real)], [str(mean)])
-        found += [Pair(name.rstrip("0123456789").rstrip("_"), scene) for scene in scenes.each]
-    if not found:
-        raise SystemExit(f"{folder} has no pairs NAME_real.png and NAME_mean.png")
-    return found
+    return [
+        Pair(each.camera, load_scenes([str(each.real)], [str(each.mean)]).each[0])
+        for each in find_pairs(folder)
+    ]
 
 
 def simulated_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
@@ -253,22 +248,27 @@ def table(found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def parser_of(description: str) -> argparse.ArgumentParser:
-    """Return the parser of a tool that compares configurations with a folder of pairs."""
-    formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=description, formatter_class=formatter)
+def options_of(documentation: str | None) -> argparse.Namespace:
+    """Return the options of a tool that compares configurations with a folder of pairs."""
+    parser = parser_of(documentation)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
-    text = "a configuration to compare; may be repeated"
-    parser.add_argument("--config", action="append", help=text)
-    parser.add_argument("--json", action="store_true")
-    return parser
+    repeated = f"a configuration to compare; may be repeated [{', '.join(CONFIGS)}]"
+    parser.add_argument("--config", action="append", help=repeated)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    options.config = options.config or CONFIGS
+    return options
+
+
+def print_report(found: Any, text: Callable[[Any], str], options: argparse.Namespace) -> None:
+    """Print results as JSON or as text."""
+    print(json.dumps(found, indent=2) if options.json else text(found))
 
 
 def main() -> None:
     """Compare the noise, and print the report."""
-    options = parser_of(__doc__ or "").parse_args()
-    found = report(options.folder, options.config or CONFIGS)
-    print(json.dumps(found, indent=2) if options.json else table(found))
+    options = options_of(__doc__)
+    print_report(report(options.folder, options.config), table, options)
 
 
 if __name__ == "__main__":

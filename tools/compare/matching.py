@@ -22,7 +22,6 @@ It needs the extra "compare" (.venv/bin/pip install -e '.[compare]').
 """
 
 import importlib.util
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,10 +34,10 @@ from clpipe.analysis.matching.simulation import Simulator
 from clpipe.base.types import Array, Doubles
 from clpipe.engine.device import open_device
 from tools.compare.judge import (
-    CONFIGS,
     iid,
     intensity_dependent,
-    parser_of,
+    options_of,
+    print_report,
     read_pairs,
     simulated_by,
 )
@@ -160,12 +159,10 @@ def table(found: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Compare the noise models, and print the table."""
-    parser = parser_of(__doc__ or "")
-    options = parser.parse_args()
+    options = options_of(__doc__)
     if not importlib.util.find_spec("cv2"):
-        parser.error("OpenCV is missing; .venv/bin/pip install -e '.[compare]'")
-    found = report(options.folder, options.config or CONFIGS)
-    print(json.dumps(found, indent=2) if options.json else table(found))
+        raise SystemExit("OpenCV is missing; .venv/bin/pip install -e '.[compare]'")
+    print_report(report(options.folder, options.config), table, options)
 
 
 if __name__ == "__main__":

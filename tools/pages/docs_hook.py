@@ -21,7 +21,9 @@ from clpipe.images.vocabularies import CLIP, DNG, JPEG, LAYERS, OPENEXR, PNG, TI
 from clpipe.inputs.annotation_keys import BOP, COCO, KITTI
 from clpipe.inputs.camera_keys import COLMAP, TRANSFORMS
 from clpipe.stage import Method
+from clpipe.stages import DEFAULT_CHAIN
 from tools import ROOT
+from tools.shared.tables import markdown
 
 NOTEBOOK = "first_steps"
 VOCABULARIES = (OPENEXR, LAYERS, PNG, TIFF, JPEG, DNG, CLIP, TRANSFORMS, COLMAP, COCO, BOP, KITTI)
@@ -50,15 +52,9 @@ def json_of(*command: str) -> Any:
     return json.loads(result.output)
 
 
-def cell(text: object) -> str:
-    """Escape text for a cell of a table."""
-    return str(text).replace("|", "\\|")
-
-
-def table(headings: list[str], rows: Sequence[Sequence[object]]) -> str:
-    """Format a table in Markdown."""
-    lines: list[Sequence[object]] = [headings, ["---"] * len(headings), *rows]
-    return "\n".join("| " + " | ".join(map(cell, line)) + " |" for line in lines) + "\n"
+def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Format a table in Markdown, with a line break."""
+    return markdown(headings, rows) + "\n"
 
 
 def code(text: object) -> str:
@@ -121,7 +117,6 @@ def _statement_rows(vocabulary: Vocabulary) -> list[list[object]]:
 def stages_page() -> str:
     """Generate the page of all stages with their methods and parameters."""
     records = json_of("stages")
-    default = [step["stage"] for step in default_chain()]
     parts = [
         "# Stages and methods\n\n"
         "This page is generated from the declarations of the stages. `clpipe stages NAME` prints "
@@ -139,7 +134,8 @@ def stages_page() -> str:
             ["stage", "image", "methods", "what it does"],
             [
                 [
-                    f"[`{r['name']}`](#{r['name']})" + ("" if r["name"] in default else " \\*"),
+                    f"[`{r['name']}`](#{r['name']})"
+                    + ("" if r["name"] in DEFAULT_CHAIN else " \\*"),
                     kinds(r),
                     ", ".join(code(m["name"]) for m in r["methods"]),
                     r["summary"],
@@ -151,14 +147,6 @@ def stages_page() -> str:
         *(stage_part(record) for record in records),
     ]
     return "\n".join(parts)
-
-
-def default_chain() -> list[dict[str, Any]]:
-    """Return the stages of the default chain from the plan's TOML."""
-    import tomllib
-
-    result = CliRunner().invoke(main, ["plan", "--toml"], catch_exceptions=False)
-    return [{"stage": name} for name in tomllib.loads(result.output)["stages"]]
 
 
 def kinds(record: dict[str, Any]) -> str:

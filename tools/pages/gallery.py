@@ -13,11 +13,13 @@ from tempfile import TemporaryDirectory
 import matplotlib
 import numpy as np
 import OpenImageIO as oiio
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 import clpipe
 from clpipe.base.types import Array
 from tools import RENDER, ROOT
+from tools.shared.options import parser_of
+from tools.shared.pictures import enlarged, sheet
 
 CAMERAS = ("sony-a7s2", "canon-6d", "nikon-d800", "oppo-reno-10x")
 ISOS = (100, 1600, 6400)
@@ -33,26 +35,7 @@ OBJECTS = (
 )
 WALL, FLOOR = len(OBJECTS), len(OBJECTS) + 1  # their numbers
 SCALE = 2
-GAP, HEAD = 6, 26
 LENS = {"method": "brown_conrady", "fx": 900, "k1": 0.12}
-
-
-def grid(rows: list[list[Image.Image]], columns: list[str], names: list[str]) -> Image.Image:
-    """Return pictures of one size in rows, with captions of columns and rows."""
-    font = ImageFont.load_default(15)
-    width, height = rows[0][0].size
-    left = max(font.getlength(name) for name in names) + 10 * any(names)
-    size = int(left) + len(columns) * (width + GAP), HEAD + len(rows) * (height + GAP)
-    page = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(page)
-    for x, caption in enumerate(columns):
-        draw.text((left + x * (width + GAP) + 2, 4), caption, fill="black", font=font)
-    for y, (row, name) in enumerate(zip(rows, names, strict=True)):
-        top = HEAD + y * (height + GAP)
-        draw.text((2, top + height // 2 - 10), name, fill="black", font=font)
-        for x, picture in enumerate(row):
-            page.paste(picture, (int(left) + x * (width + GAP), top))
-    return page
 
 
 def cameras(folder: Path) -> Image.Image:
@@ -65,10 +48,10 @@ def cameras(folder: Path) -> Image.Image:
         row = []
         for camera in CAMERAS:
             picture = Image.open(folder / camera / f"iso{iso}" / f"{RENDER.stem}.png")
-            crop = picture.crop((left, top, left + width, top + height))
-            row.append(crop.resize((width * SCALE, height * SCALE), Image.Resampling.NEAREST))
+            crop = np.asarray(picture.crop((left, top, left + width, top + height)))
+            row.append((camera if iso == ISOS[0] else "", enlarged(crop, SCALE)))
         rows.append(row)
-    return grid(rows, list(CAMERAS), [f"ISO {iso}" for iso in ISOS])
+    return sheet(rows, [f"ISO {iso}" for iso in ISOS])
 
 
 def truths(folder: Path) -> Image.Image:
@@ -88,8 +71,9 @@ def truths(folder: Path) -> Image.Image:
     pictures["carried.exr: depth"] = coloured(-layer(carried, depth))
     pictures["carried.exr: objects"] = coloured(layer(carried, label), "tab20")
     size = (240, 160)
-    small = [i.convert("RGB").resize(size, Image.Resampling.BOX) for i in pictures.values()]
-    return grid([small], list(pictures), [""])
+    boxed = Image.Resampling.BOX
+    small = {name: i.convert("RGB").resize(size, boxed) for name, i in pictures.items()}
+    return sheet([[(name, np.asarray(picture)) for name, picture in small.items()]])
 
 
 def with_objects(folder: Path) -> Path:
@@ -131,6 +115,7 @@ def coloured(values: Array, colours: str = "viridis") -> Image.Image:
 
 def main() -> None:
     """Write the pictures."""
+    parser_of(__doc__).parse_args()
     with TemporaryDirectory() as name:
         for stem, make in (("cameras", cameras), ("truths", truths)):
             path = ROOT / "docs" / f"gallery_{stem}.webp"

@@ -41,10 +41,10 @@ import clpipe
 from clpipe.camera.profile import load_camera
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import Settings
+from tools.shared.pairs import find_pairs
 from tools.training.figures import NOISY, Score, draw_crops, joined, scores, table
 from tools.training.networks import NETWORKS, denoised, train
 from tools.training.patches import Batch, from_pairs, gaussian, read, with_noise
-from tools.training.real_pairs import find_pairs
 
 DRAWS = 6  # pictures of each render and look, each with its own ISO
 PHOTOS = (".png", ".jpg", ".jpeg")
