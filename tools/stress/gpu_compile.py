@@ -14,17 +14,13 @@ The columns are:
 
 - registers: per work item (Intel: per thread).
 - spilled B: bytes that spill from registers.
-- private B: bytes of private memory. They include spills, except on Intel.
-- occupancy: the limit by registers and work-groups (Intel: work items per thread).
-- instructions: in the whole kernel.
-- a pixel: instructions per pixel away from the edges; those in a loop count once.
+- instructions: in the kernel.
 - fused: fused multiply-adds of floats.
 
-The exit status is 1 if a kernel does not compile, or spills more than ALLOWED. It is also 1 if a
+The exit status is 1 if a kernel does not compile, or spills. It is also 1 if a
 kernel of the raw has a fused multiply-add, because the raw must be identical on every device.
 """
 
-import argparse
 import os
 import re
 import shutil
@@ -34,7 +30,7 @@ import sysconfig
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -45,17 +41,16 @@ from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
 from clpipe.engine.check import ISO, chain_for, sensor_parameters
 from clpipe.engine.codegen import write_kernel
-from clpipe.engine.ir import Kernel, Launch
+from clpipe.engine.ir import Kernel
 from clpipe.engine.plan import make_plan
-from clpipe.engine.work_items import columns_of
 from clpipe.reference.cfa import PATTERNS
 from clpipe.stage import variant_label, variants
+from tools.shared.options import parser_of
+from tools.shared.tables import markdown
 
-ALLOWED: dict[str, int] = {}  # bytes that a launch may spill on any target; 0 for all others
 RAW = "raw: "  # prefix of the names of chains from a render to its raw
 OPENCL = "-x cl -cl-std=CL1.2 -O3 -w -S -Xclang -fdeclare-opencl-builtins"
 OPENCL += " -Xclang -finclude-default-header -Xclang -mlink-builtin-bitcode -Xclang"
-NEAR_EDGE = "INLINE bool near_edge(site at, uint rows, extent e) {"
 NVIDIA_FUSED = r"\bFFMA"
 AMD_FUSED = r"\bv_(dual_)?(fma|fmac|mad|mac|fmamk|fmaak|madmk|madak)_f32|\bv_pk_fma_f32|\bv_fma_mix"
 INTEL_FUSED = r"(?m)^(?:\(.*?\))?\s*mad .*:f\b"
@@ -71,8 +66,6 @@ class Compiled:
 
     registers: int
     spilled: int  # bytes
-    private: int  # bytes
-    occupancy: str
     instructions: int
     fused: int
 
@@ -83,12 +76,6 @@ class Job:
 
     chain: str
     kernel: Kernel
-
-    @property
-    def pixels(self) -> int:
-        """Pixels per work item; 0 if work items have no pixels."""
-        launch = self.kernel.launch
-        return launch.rows * columns_of(launch, 1) if isinstance(launch, Launch) else 0
 
 
 def tool(name: str) -> str:
@@ -159,17 +146,9 @@ def for_nvidia(arch: str, source: Path) -> Compiled:
     output_of(clang(), *target, *OPENCL.split(), library, "-o", ptx, source)
     log = output_of(assembler, f"-arch={arch}", "-v", "-o", cubin, ptx)
     text = output_of(disassembler, "-c", cubin)
-    registers = number_in(log, r"Used (\d+) registers")
-    # A multiprocessor can hold 32 groups, 64 warps and 65536 registers, allocated to warps in units
-    # of 256.
-    group = -(-number_in(source.read_text("utf-8"), r"reqd_work_group_size\((\d+)") // 32)
-    warps = 65536 // (-(-registers * 32 // 256) * 256)
-    warps = min(warps // group, 64 // group, 32) * group
     return Compiled(
-        registers,
+        number_in(log, r"Used (\d+) registers"),
         number_in(log, r"(\d+) bytes spill stores"),
-        number_in(log, r"(\d+) bytes stack frame"),
-        f"{warps / 64:.0%}",
         len(re.findall(r"(?m)^\s*/\*[0-9a-f]+\*/\s+(?!NOP)", text)),
         len(re.findall(NVIDIA_FUSED, text)),
     )
@@ -185,8 +164,6 @@ def for_amd(arch: str, source: Path) -> Compiled:
     return Compiled(
         number_in(text, r"; NumVgprs: (\d+)"),
         number_in(text, r"\.vgpr_spill_count: (\d+)") * 4,
-        number_in(text, r"; ScratchSize: (\d+)"),
-        f"{number_in(text, '; Occupancy: ([0-9]+)') / 16:.0%}",
         len(re.findall(r"(?m)^\t[a-z]", text)),
         len(re.findall(AMD_FUSED, text)),
     )
@@ -208,8 +185,6 @@ def for_intel(arch: str, source: Path) -> Compiled:
     return Compiled(
         number_in(binary, r"grf_count: +(\d+)"),
         number_in(text, r"//\.spill size (\d+)"),
-        number_in(binary, r"usage: +private_space\n +size: +(\d+)"),
-        f"SIMD{width}",
         number_in(text, r"//\.instCount (\d+)"),
         len(re.findall(INTEL_FUSED, text)),
     )
@@ -255,22 +230,9 @@ def jobs(only: str) -> list[Job]:
     return list(found.values())
 
 
-def compiled(job: Job, target: str, folder: Path) -> tuple[Compiled, int]:
-    """Compile a kernel for a target; also count its instructions without code for edges."""
-    whole, inside = (folder / f"{target}-{job.kernel.name}-{name}.cl" for name in ("", "inside"))
-    source = job.kernel.source
-    assert NEAR_EDGE in source
-    whole.write_text(source, "utf-8")
-    result = TARGETS[target](whole)
-    if not job.pixels:
-        return result, 0
-    inside.write_text(source.replace(NEAR_EDGE, f"{NEAR_EDGE} return false;"), "utf-8")
-    return result, TARGETS[target](inside).instructions
-
-
 def violation(job: Job, result: Compiled) -> str:
     """Return the requirement that a kernel violates, or an empty text."""
-    if result.spilled > ALLOWED.get(job.kernel.launch.name, 0):
+    if result.spilled:
         return "SPILLS"
     return "FUSED" if job.chain.startswith(RAW) and result.fused else ""
 
@@ -282,35 +244,23 @@ def row(job: Job, target: str, folder: Path) -> tuple[list[str], bool]:
         MissingError: a compiler is not installed.
     """
     name = [job.chain, job.kernel.launch.name]
+    source = folder / f"{target}-{job.kernel.name}.cl"
+    source.write_text(job.kernel.source, "utf-8")
     try:
-        result, inside = compiled(job, target, folder)
+        result = TARGETS[target](source)
     except subprocess.CalledProcessError as error:
         lines = error.stdout.strip().splitlines() or ["it printed nothing"]
-        return [*name, *[""] * 7, f"does not compile: {lines[-1]}"], False
+        return [*name, *[""] * 4, f"does not compile: {lines[-1]}"], False
     wrong = violation(job, result)
-    numbers = [result.registers, result.spilled, result.private, result.occupancy]
-    numbers += [result.instructions, inside // job.pixels if job.pixels else "-", result.fused]
-    return [*name, *map(str, numbers), wrong], not wrong
+    return [*name, *map(str, astuple(result)), wrong], not wrong
 
 
-HEADINGS = ["chain", "launch", "registers", "spilled B", "private B", "occupancy"]
-HEADINGS += ["instructions", "a pixel", "fused", ""]
-
-
-def show(target: str, rows: list[list[str]], wrong: int) -> None:
-    """Print the table of a target."""
-    print(f"{target}: {len(rows)} kernels, {wrong} with violations")
-    table = [HEADINGS, *rows]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    for texts in table:
-        names = map(str.ljust, texts[:2], widths)
-        print("  ".join([*names, *map(str.rjust, texts[2:-1], widths[2:]), texts[-1]]).rstrip())
-    print(flush=True)
+HEADINGS = ["chain", "launch", "registers", "spilled B", "instructions", "fused", ""]
 
 
 def main() -> int:
     """Compile the kernels, and print a table for each target."""
-    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="compile only chains with TEXT in their name"
     )
@@ -327,7 +277,11 @@ def main() -> int:
                 print(f"{target}: skipped, there is {error}\n")
                 continue
             passed += [good for _, good in rows]
-            show(target, [texts for texts, _ in rows], sum(not good for _, good in rows))
+            wrong = sum(not good for _, good in rows)
+            table = markdown(HEADINGS, (texts for texts, _ in rows))
+            print(
+                f"{target}: {len(rows)} kernels, {wrong} with violations\n\n{table}\n", flush=True
+            )
     if not passed:
         print("gpu_compile: no target has a compiler", file=sys.stderr)
     return 0 if passed and all(passed) else 1
