@@ -14,6 +14,7 @@ from collections import Counter
 from pathlib import Path
 
 from tools import ROOT
+from tools.shared.options import parser_of
 
 IGNORED = {
     tokenize.COMMENT,
@@ -57,6 +58,7 @@ def counts(root: Path, budgets: dict[str, int]) -> Counter[str]:
 
 def main() -> None:
     """Print each folder's lines and budget."""
+    parser_of(__doc__).parse_args()
     budgets = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["lines"]
     found = counts(ROOT, budgets)
     for name, budget in budgets.items():

@@ -18,6 +18,7 @@ from clpipe.chain.settings import Settings
 from clpipe.commands.plan import plan_record
 from clpipe.engine.plan import make_plan
 from tools import ROOT
+from tools.shared.options import parser_of
 
 DOCS = ROOT / "docs"
 STYLE = """<style>
@@ -179,6 +180,7 @@ PICTURES = {"packages.svg": packages_picture, "launches.svg": launches_picture}
 
 def main() -> None:
     """Write the pictures."""
+    parser_of(__doc__).parse_args()
     for name, picture in PICTURES.items():
         (DOCS / name).write_text(picture(), "utf-8")
 

@@ -24,6 +24,7 @@ from clpipe.chain.methods import TABLE_MODELS
 from clpipe.chain.options import OPTIONS
 from clpipe.chain.registry import all_stages
 from tools import ROOT
+from tools.shared.options import parser_of
 
 PATH = ROOT / "clpipe" / "chain" / "keywords.pyi"
 API = ROOT / "clpipe" / "batch" / "api.py"
@@ -118,7 +119,13 @@ def api_text() -> str:
     return f"{before}{start}{arguments}\n{end}{after}"
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write both files."""
+    parser_of(__doc__).parse_args()
     for path, text in ((PATH, text_of()), (API, api_text())):
         path.write_text(text, "utf-8")
         print(path.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()
