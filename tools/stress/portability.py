@@ -19,7 +19,6 @@ All files are in the work folder, and later runs reuse them. WORK/runs contains 
 run.
 """
 
-import contextlib
 import json
 import os
 import re
@@ -289,23 +288,13 @@ class Run:
         """
         out, err = self.folder / f"{name}.out", self.folder / f"{name}.err"
         with out.open("w", encoding="utf-8") as stdout, err.open("w", encoding="utf-8") as stderr:
-            process = subprocess.Popen(
-                [python, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=stdout,
-                stderr=stderr,
-                env=self.environment,
-                cwd=self.folder,
-                start_new_session=True,
-            )
+            streams = {"stdin": subprocess.DEVNULL, "stdout": stdout, "stderr": stderr}
+            command, left = [python, *arguments], self.end - time.monotonic()
+            options = {"env": self.environment, "cwd": self.folder, "timeout": left}
             try:
-                status = process.wait(self.end - time.monotonic())
+                status = subprocess.run(command, **streams, **options, check=False).returncode
             except subprocess.TimeoutExpired:
                 raise BrokenError(f"{name} did not end within {LIMIT} s") from None
-            finally:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)  # also its child processes
-                process.wait()
         if status:
             errors = err.read_text("utf-8", errors="replace").strip() or "it printed nothing"
             how = signal.Signals(-status).name if status < 0 else f"exit status {status}"
