@@ -6,7 +6,6 @@ of its dependencies, chosen by pip for the machine that this runs on.
 Usage: tools/run blender extension [-o clpipe-blender.zip]
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from clpipe.chain.files import built_in_configs
 from clpipe.chain.settings import Settings
 from clpipe.commands.cameras import make_and_model
 from tools import ROOT
+from tools.shared.options import parser_of
 
 SOURCE = ROOT / "tools" / "blender" / "source"
 # For each Python, the first Blender that has it, and the first that no longer has it.
@@ -116,16 +116,11 @@ def build(output: Path, python: str, wheels: list[Path]) -> None:
 
 def main() -> int:
     """Build the extension, and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("clpipe-blender.zip"), help="the extension"
-    )
-    parser.add_argument(
-        "--python",
-        choices=BLENDERS,
-        default="3.11",
-        help="Blender's Python version: 3.11, or 3.13 from Blender 5.1 on",
-    )
+    parser = parser_of(__doc__)
+    path = Path("clpipe-blender.zip")
+    parser.add_argument("-o", "--output", type=Path, default=path, help="the extension")
+    text = "Blender's Python version: 3.11, or 3.13 from Blender 5.1 on"
+    parser.add_argument("--python", choices=BLENDERS, default="3.11", help=text)
     options = parser.parse_args()
     if not options.output.absolute().parent.is_dir():
         parser.error(f"{options.output}: the parent folder does not exist; create it")
