@@ -34,7 +34,7 @@ from clpipe.analysis.matching.columns import Noise, figures_of
 from clpipe.analysis.matching.scenes import Scene, load_scenes
 from clpipe.analysis.matching.search import target_of
 from clpipe.analysis.matching.simulation import Simulator
-from clpipe.base.types import Array, Doubles
+from clpipe.base.types import Array
 from clpipe.chain.files import load_settings
 from clpipe.chain.settings import overlay
 from clpipe.engine.device import open_device
@@ -157,8 +157,8 @@ def report(folder: Path, configs: Sequence[str]) -> dict[str, Any]:
     sources: dict[str, Callable[[Scene], Noise]] = {REAL: lambda scene: scene.noise}
     sources |= {config: simulated_by(config, simulator) for config in configs}
     sources |= {"iid": as_strong(iid), "intensity-dependent": as_strong(intensity_dependent)}
-    figures: dict[str, Doubles] = {}  # (picture, detector, figure)
-    strengths = {}
+    models: dict[str, Any] = {}
+    real = np.empty(0)
     for source, noise_of in sources.items():
         rows, levels = [], []
         for scene in scenes:
@@ -167,24 +167,15 @@ def report(folder: Path, configs: Sequence[str]) -> dict[str, Any]:
             both = grey(scene.mean), grey(noisy)
             rows.append([compared(detector, *both) for detector in DETECTORS])
             levels.append(strength(noise, scene))
-        figures[source], strengths[source] = np.array(rows), float(np.mean(levels))
-    models = {
-        source: {
-            "luma_rms": strengths[source],
-            **{
-                detector: {
-                    name: {
-                        "mean": float(own[:, d, k].mean()),
-                        "error": float(abs(own - figures[REAL])[:, d, k].mean()),
-                        "each": own[:, d, k].tolist(),
-                    }
-                    for k, name in enumerate(Matching._fields)
-                }
-                for d, detector in enumerate(DETECTORS)
-            },
-        }
-        for source, own in figures.items()
-    }
+        figures = np.array(rows)  # (picture, detector, figure)
+        real = figures if source == REAL else real
+        models[source] = {"luma_rms": float(np.mean(levels))}
+        for d, detector in enumerate(DETECTORS):
+            for k, name in enumerate(Matching._fields):
+                own = figures[:, d, k]
+                error = float(abs(own - real[:, d, k]).mean())
+                figure = {"mean": float(own.mean()), "error": error, "each": own.tolist()}
+                models[source].setdefault(detector, {})[name] = figure
     return {"pictures": [scene.name for scene in scenes], "models": models}
 
 

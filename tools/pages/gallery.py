@@ -3,10 +3,9 @@
     tools/run pages gallery
 
 It writes docs/gallery_cameras.webp and docs/gallery_truths.webp. Their cells are results of the
-commands above them in docs/index.md. The tool first adds a layer of object numbers to the render.
+commands above them in docs/index.md. The ground truth is of a view of the reconstruction.
 """
 
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -24,16 +23,7 @@ from tools.shared.pictures import enlarged, sheet
 CAMERAS = ("sony-a7s2", "canon-6d", "nikon-d800", "oppo-reno-10x")
 ISOS = (100, 1600, 6400)
 CROP = (560, 292, 120, 96)  # x, y, width, height, with smooth places, edges and a dark corner
-SCENES = ROOT / "tools" / "reconstruction" / "data"
-# x, y and radius, in m, of the objects that tools/reconstruction/scene.py adds.
-OBJECTS = (
-    (-1.1, 0.1, 0.55),
-    (-0.45, 0.55, 0.32),
-    (0.1, -0.1, 0.42),
-    (0.45, 0.6, 0.29),
-    (1.2, 0.25, 0.43),
-)
-WALL, FLOOR = len(OBJECTS), len(OBJECTS) + 1  # their numbers
+SCENE = ROOT / "tools" / "reconstruction" / "data" / "view0.exr"
 SCALE = 2
 LENS = {"method": "brown_conrady", "fx": 900, "k1": 0.12}
 
@@ -56,10 +46,9 @@ def cameras(folder: Path) -> Image.Image:
 
 def truths(folder: Path) -> Image.Image:
     """Return a view of a scene with its ground truth."""
-    options = {"truth": ["clean", "variance"], "carry": ["Z:depth", "object:label"]}
-    scene = with_objects(folder)
-    list(clpipe.run(scene, folder, format="png", iso=3200, distortion=LENS, **options))
-    name = scene.stem
+    options = {"truth": ["clean", "variance"], "carry": ["Z:depth", "texture:label"]}
+    list(clpipe.run(SCENE, folder, format="png", iso=3200, distortion=LENS, **options))
+    name = SCENE.stem
     pictures = {
         f"{name}.png": Image.open(folder / f"{name}.png"),
         "truth_clean.png": Image.open(folder / f"{name}.truth_clean.png"),
@@ -67,36 +56,13 @@ def truths(folder: Path) -> Image.Image:
     }
     carried = folder / f"{name}.carried.exr"
     names = oiio.ImageBuf(str(carried)).spec().channelnames
-    depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "object"))
+    depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "texture"))
     pictures["carried.exr: depth"] = coloured(-layer(carried, depth))
-    pictures["carried.exr: objects"] = coloured(layer(carried, label), "tab20")
+    pictures["carried.exr: textures"] = coloured(layer(carried, label), "tab20")
     size = (240, 160)
     boxed = Image.Resampling.BOX
     small = {name: i.convert("RGB").resize(size, boxed) for name, i in pictures.items()}
     return sheet([[(name, np.asarray(picture)) for name, picture in small.items()]])
-
-
-def with_objects(folder: Path) -> Path:
-    """Write a view with a layer "object", the object number of each pixel, from its depth."""
-    view = json.loads((SCENES / "cameras.json").read_text("utf-8"))["views"][0]
-    render = oiio.ImageBuf(str(SCENES / view["file"]))
-    depth = layer(SCENES / view["file"], render.spec().channelnames.index("Z"))
-    (height, width), k = depth.shape, np.array(view["K"])
-    v, u = np.mgrid[:height, :width] + 0.5
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(k).T
-    points = (rays * depth[..., None] - view["t"]) @ np.array(view["R"])  # in the world
-    centres, radii = np.array(OBJECTS)[:, :2], np.array(OBJECTS)[:, 2]
-    distances = np.linalg.norm(points[..., None, :2] - centres, axis=-1) / radii
-    numbers = np.where(points[..., 2] < 0.01, FLOOR, distances.argmin(-1))
-    numbers = np.where(points[..., 1] > 1.19, WALL, numbers)
-    samples = np.dstack([*(layer(SCENES / view["file"], i) for i in range(4)), numbers])
-    spec = oiio.ImageSpec(width, height, 5, oiio.FLOAT)
-    spec.channelnames = ("R", "G", "B", "Z", "object")
-    written = oiio.ImageBuf(spec)
-    written.set_pixels(oiio.ROI(), np.ascontiguousarray(samples, np.float32))
-    path = folder.with_name(view["file"])
-    written.write(str(path))
-    return path
 
 
 def layer(path: Path, channel: int) -> Array:
