@@ -20,6 +20,7 @@ import clpipe
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.settings import Settings
+from clpipe.chain.toml import value_text
 from clpipe.commands.cameras import make_and_model
 from tools import ROOT
 from tools.shared.options import parser_of
@@ -60,15 +61,6 @@ def manifest(python: str, wheels: list[str]) -> dict[str, Any]:
     }
 
 
-def toml(values: dict[str, Any]) -> str:
-    """Format plain values, lists and tables of strings as TOML."""
-    lines = [f"{k} = {json.dumps(v)}" for k, v in values.items() if not isinstance(v, dict)]
-    for name, table in values.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{name}]", toml(table)]
-    return "\n".join(lines) + "\n"
-
-
 def choices() -> dict[str, Any]:
     """Return the panel's choices: clpipe's cameras and configurations, and its defaults."""
     return {
@@ -100,7 +92,8 @@ def build(output: Path, python: str, wheels: list[Path]) -> None:
     shared = [wheel for wheel in wheels if wheel not in private]
     with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
         names = [wheel.name for wheel in shared]
-        archive.writestr("blender_manifest.toml", toml(manifest(python, names)))
+        lines = (f"{k} = {value_text(v)}\n" for k, v in manifest(python, names).items())
+        archive.writestr("blender_manifest.toml", "".join(lines))
         archive.writestr("choices.json", json.dumps(choices(), indent=1))
         archive.write(ROOT / "LICENSE", "LICENSE")
         for path in sorted(SOURCE.glob("*.py")):

@@ -3,7 +3,7 @@
 All pictures are in sRGB levels, 0 to 255.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +43,6 @@ class ColourErrors:
     hue: float  # median error, degrees
     largest_hue: float  # degrees
     chroma: float  # median ratio to the chart's
-
-    def record(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
 
 
 def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> ColourErrors:

@@ -28,15 +28,8 @@ from clpipe.stage import Kind
 from tools.compare.timing import Comparison, Work, interleaved
 from tools.shared.options import count_of, parser_of, sides_of
 
-STAGES = (
-    "normalize",
-    "white_balance",
-    "demosaic",
-    "color_matrix",
-    "sharpen",
-    "tone_curve",
-    "gamma",
-)
+STAGES = ("normalize", "white_balance", "demosaic", "color_matrix")
+STAGES += ("sharpen", "tone_curve", "gamma")
 
 
 def main() -> None:

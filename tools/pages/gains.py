@@ -19,7 +19,6 @@ from tools.shared.options import parser_of
 LABELS = {
     "awgn": "Gaussian noise, 0 to 55 levels",
     "iid": "Gaussian noise, as strong as clpipe's",
-    "intensity": "the same, by intensity",
     "real": "another camera's real pairs",
     "clpipe": "clpipe",
 }

@@ -52,23 +52,22 @@ def truths(folder: Path) -> Image.Image:
     pictures = {
         f"{name}.png": Image.open(folder / f"{name}.png"),
         "truth_clean.png": Image.open(folder / f"{name}.truth_clean.png"),
-        "truth_variance.exr": coloured(np.sqrt(layer(folder / f"{name}.truth_variance.exr", 0))),
+        "truth_variance.exr": coloured(np.sqrt(layer(folder / f"{name}.truth_variance.exr"))),
     }
     carried = folder / f"{name}.carried.exr"
-    names = oiio.ImageBuf(str(carried)).spec().channelnames
-    depth, label = (next(i for i, n in enumerate(names) if key in n) for key in ("Z", "texture"))
-    pictures["carried.exr: depth"] = coloured(-layer(carried, depth))
-    pictures["carried.exr: textures"] = coloured(layer(carried, label), "tab20")
+    pictures["carried.exr: depth"] = coloured(-layer(carried, "Z"))
+    pictures["carried.exr: textures"] = coloured(layer(carried, "texture"), "tab20")
     size = (240, 160)
     boxed = Image.Resampling.BOX
     small = {name: i.convert("RGB").resize(size, boxed) for name, i in pictures.items()}
     return sheet([[(name, np.asarray(picture)) for name, picture in small.items()]])
 
 
-def layer(path: Path, channel: int) -> Array:
-    """Return a channel of a file, (height, width)."""
-    pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
-    return np.asarray(pixels).reshape(*pixels.shape[:2], -1)[..., channel]
+def layer(path: Path, word: str = "") -> Array:
+    """Return the first channel of a file whose name contains a word, (height, width)."""
+    image = oiio.ImageBuf(str(path))
+    channel = next(i for i, name in enumerate(image.spec().channelnames) if word in name)
+    return image.get_pixels(oiio.FLOAT)[..., channel]
 
 
 def coloured(values: Array, colours: str = "viridis") -> Image.Image:

@@ -181,13 +181,9 @@ def draw(
 
 def crops(groups: Mapping[str, Pair]) -> Image.Image:
     """Draw two crops of each picture at 400 %, with a column for each picture."""
-    first = next(iter(groups.values())).clean.astype(np.float32) / np.float32(255)
-    kinds = [place.name for place in choose_crops(PLACES, first)]
-    rows = []
-    for number, kind in enumerate(kinds):
-        row = []
-        for name, pair in groups.items():
-            place = choose_crops(PLACES, pair.clean.astype(np.float32) / np.float32(255))[number]
-            row.append((name if kind == kinds[0] else "", enlarged(place.of(pair.noisy), SCALE)))
-        rows.append(row)
-    return sheet(rows, kinds)
+    rows: dict[str, list[tuple[str, Array]]] = {place: [] for place in PLACES}
+    for name, pair in groups.items():
+        for place in choose_crops(PLACES, pair.clean.astype(np.float32) / np.float32(255)):
+            heading = name if place.name == PLACES[0] else ""
+            rows[place.name].append((heading, enlarged(place.of(pair.noisy), SCALE)))
+    return sheet(rows.values(), PLACES)

@@ -67,6 +67,7 @@ REAL = {
     "R-B": 0.56,
 }
 ALLOWED = 0.1
+LAGS_SHOWN = {"1 right": (0, 1), "1 below": (1, 0), "diagonal": (1, 1), "2 right": (0, 2)}
 LEVELS = ("RGGB", 0.0, 1.0)  # the pattern, which display pictures ignore, and the range
 
 
@@ -184,24 +185,14 @@ def finished(config: str, iso: float) -> dict[str, float]:
     report = measure([noisy], truth)
     of = {one.name: one for one in report.channels}
 
-    def lag(names: tuple[str, ...], down: int, right: int) -> float:
-        return float(np.mean([of[n].autocorrelation[LAGS + down, LAGS + right] for n in names]))
-
-    luma, chroma = ("Y",), ("Cb", "Cr")
-    return {
-        "luma, 1 right": lag(luma, 0, 1),
-        "luma, 1 below": lag(luma, 1, 0),
-        "luma, diagonal": lag(luma, 1, 1),
-        "chroma, 1 right": lag(chroma, 0, 1),
-        "chroma, 1 below": lag(chroma, 1, 0),
-        "chroma, diagonal": lag(chroma, 1, 1),
-        "chroma, 2 right": lag(chroma, 0, 2),
-        "luma left after 2x2": of["Y"].energy_left,
-        "chroma left after 2x2": float(np.mean([of[n].energy_left for n in chroma])),
-        "R-G": report.correlations["R", "G"],
-        "G-B": report.correlations["G", "B"],
-        "R-B": report.correlations["R", "B"],
-    }
+    found = {pair: report.correlations[tuple(pair.split("-"))] for pair in ("R-G", "G-B", "R-B")}
+    for kind, names in {"luma": ("Y",), "chroma": ("Cb", "Cr")}.items():
+        left = [of[name].energy_left for name in names]
+        found[f"{kind} left after 2x2"] = float(np.mean(left))
+        for where, (down, right) in LAGS_SHOWN.items():
+            lags = [of[name].autocorrelation[LAGS + down, LAGS + right] for name in names]
+            found[f"{kind}, {where}"] = float(np.mean(lags))
+    return {what: found[what] for what in REAL}
 
 
 def closed_loop(options: argparse.Namespace) -> bool:

@@ -20,17 +20,16 @@ OpenCV's semi-global matching finds the depth of neighbouring views at full and 
 The tool prints tables, and writes them with the figures and pictures to OUT, as Markdown and CSV.
 """
 
-import argparse
 import csv
 import importlib.util
 import itertools
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -226,9 +225,7 @@ def report_stereo(out: Path, rows: Sequence[StereoRow], text: list[str]) -> None
         weak[f"{resolution} resolution, weak texture"] = tables["weak"]
         for value, label in (("median_mm", "Median"), ("rms_mm", "RMS")):
             errors = {
-                name: table_of(
-                    rows, lambda r, v=value: getattr(r, v), resolution=resolution, texture=name
-                )
+                name: table_of(rows, attrgetter(value), resolution=resolution, texture=name)
                 for name in (*TEXTURES, ALL)
             }
             text.append(as_markdown(f"{label} error, {resolution} resolution, mm", errors, ".1f"))
@@ -267,14 +264,6 @@ def energies(pictures: Pictures) -> str:
     return f"### Variance that survives averaging 2x2\n\n{markdown(heads, rows)}\n"
 
 
-def program(text: str) -> Path:
-    """Find the path of a program."""
-    path = shutil.which(text)
-    if path is None:
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected a program")
-    return Path(path).absolute()
-
-
 def main() -> int:
     """Run the experiment."""
     parser = parser_of(__doc__)
@@ -283,11 +272,13 @@ def main() -> int:
     add("--iso", type=count_of, nargs="+", default=ISOS, help="the ISOs [%(default)s]")
     add("--seeds", type=count_of, default=SEEDS, help="number of seeds of the noise [%(default)s]")
     add("-c", "--config", default="paper", help="configuration of clpipe [%(default)s]")
-    add("--pmvs", type=program, metavar="PATH", help="the program pmvs2")
+    add("--pmvs", type=Path, metavar="PATH", help="the program pmvs2")
     add("--data", type=Path, default=DATA, help="folder of the views [%(default)s]")
     text = "render the views into --data, with Blender or a Python with bpy"
     add("--render", metavar="BLENDER", help=text)
     options = parser.parse_args()
+    if options.pmvs and not options.pmvs.is_file():
+        parser.error(f"--pmvs: {options.pmvs} does not exist; give the path of the program")
     for module in NEEDED:
         if importlib.util.find_spec(module) is None:
             print(f"{module}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr)
@@ -305,7 +296,8 @@ def main() -> int:
         shown = min(isos, key=lambda iso: abs(iso - SHOWN))
         stereo_pictures(views, pictures, (CLEAN, CAMERA, IID, HALF), shown)
         if options.pmvs:
-            report_points(options.output, compare_points(options.pmvs, views, pictures), text)
+            found = compare_points(options.pmvs.absolute(), views, pictures)
+            report_points(options.output, found, text)
     except subprocess.CalledProcessError:
         return 1  # clpipe printed the reason
     except (ClpipeError, ProgramError, ValueError, OSError) as error:

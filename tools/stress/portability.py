@@ -63,23 +63,6 @@ COMPARE = """if True:
     same = one[1].dtype == two[1].dtype and one[1].tobytes() == two[1].tobytes()
     print(json.dumps([same, float(np.abs(one[0].astype(np.float32) - two[0]).max())]))
 """
-# Pip cannot resolve dependencies for another machine, so this lists them. It skips PoCL's wheel,
-# whose marker names a machine.
-PACKAGES = """if True:
-    import re
-    from importlib.metadata import PackageNotFoundError, requires, version
-    found, left = {}, ["clpipe"]
-    while left:
-        for line in requires(left.pop()) or ():
-            name, marker = re.match(r"[\\w.-]+", line)[0], line.partition(";")[2]
-            if name not in found and "extra" not in marker and "machine" not in marker:
-                try:
-                    found[name] = version(name)
-                except PackageNotFoundError:
-                    continue
-                left.append(name)
-    print(*(f"{name}=={of}" for name, of in found.items()))
-"""
 STEP = 1 / 255  # the largest difference of pictures; only raws are identical on all devices
 
 
@@ -214,9 +197,11 @@ def icd_of(machine: str, work: Path) -> str:
 def arm64_packages(work: Path, python: str) -> Path:
     """Install the project and its dependencies for arm64, in the versions of the work folder.
 
-    ``python`` is a version such as 3.11.
+    ``python`` is a version such as 3.11. Pip cannot resolve dependencies for another machine, so
+    the versions are those of this one, without PoCL's wheel.
     """
-    versions = output_of(work / "venv/bin/python", "-c", PACKAGES).split()
+    listed = output_of(work / "venv/bin/python", "-m", "pip", "freeze").splitlines()
+    versions = [line for line in listed if "==" in line and not line.startswith("pocl")]
     packages, done = work / "arm64/packages", work / "arm64/packages.txt"
     if not done.exists() or done.read_text("utf-8").split() != versions:
         shutil.rmtree(packages, ignore_errors=True)

@@ -27,7 +27,7 @@ PHOTOS = (".png", ".jpg", ".jpeg")
 WIDEST = (0.0, 55.0)  # levels; sigma of awgn
 USUAL_ISO = (1000.0, 6400.0)  # for a configuration without an ISO
 CLPIPE = "clpipe"
-BASELINES = ("iid", "intensity")  # values of --truth
+IID = "iid"  # a value of --truth, and a regime
 SHOWN = 3  # scenes in crops.png
 
 Pairs = list[tuple[Tensor, Tensor]]  # pictures and their truths, (3, height, width) uint8
@@ -100,7 +100,7 @@ def make_pairs(options: argparse.Namespace, folder: Path) -> Mapping[str, Pairs]
     """Develop pictures and their ground truth with clpipe, by regime."""
     photos = [str(p) for p in options.inputs if p.suffix.lower() in PHOTOS]
     renders = [str(p) for p in options.inputs if p.suffix.lower() not in PHOTOS]
-    truths = ["development", *(r for r in BASELINES if r in options.regimes)]
+    truths = ["development", *(r for r in options.regimes if r == IID)]
     for number, look in enumerate(options.config or ["training"]):
         iso = iso_of(look, options.iso)
         for kind, inputs, config in (("r", renders, [look]), ("p", photos, ["unprocess", look])):
@@ -157,9 +157,6 @@ def batches_of(
     for regime in options.regimes:
         if regime == "awgn":
             yield regime, with_noise(clean, gaussian(*WIDEST))
-        elif regime == "test":
-            sigmas = [float((n.float() - c).std()) for n, c in tests]
-            yield regime, with_noise(clean, gaussian(min(sigmas), max(sigmas)))
         elif regime == "real":
             real = [pair for folder in options.pairs for pair in find_pairs(folder)]
             yield regime, from_pairs([(read(pair.real), read(pair.mean)) for pair in real])

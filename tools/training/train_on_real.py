@@ -8,8 +8,6 @@ in the noise:
 - clpipe: pictures that clpipe develops, with their development without noise.
 - awgn: Gaussian noise with a sigma of 0 to 55 levels on that development.
 - iid: Gaussian noise with the strength of clpipe's noise in each picture.
-- intensity: Gaussian noise with the strength of clpipe's noise at each intensity.
-- test: Gaussian noise with the sigma of the test pictures, which is unknown in practice.
 - real: the pictures of --pairs, with the real noise of another camera.
 
 --network selects the networks. Each is trained on all regimes:
@@ -31,7 +29,7 @@ from clpipe.base.errors import ClpipeError
 from tools.shared.options import count_of, parser_of
 from tools.shared.pairs import find_pairs
 
-REGIMES = ("clpipe", "awgn", "iid", "intensity", "test", "real")
+REGIMES = ("clpipe", "awgn", "iid", "real")
 
 
 def main() -> None:
