@@ -8,7 +8,6 @@ import pytest
 from clpipe.batch.bench import Workload
 from clpipe.chain.request import Request
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
-from tools.compare import methods as other_methods
 from tools.compare import opencv as tool
 from tools.compare import timing
 
@@ -36,7 +35,6 @@ def test_ratios_are_computed_within_a_round():
     row = timing.Comparison("w", 12.0, (1.0, 10.0, 1.0), {"x": (4.0, 40.0, 2.0)})
     assert row.ratios("x") == (3, 4, 4)
     assert row.cells() == ["w", "12", "3", "4.00", "3.00 4.00"]
-    assert row.record()["x"] == {"mp_per_s": 3.0, "ratio_quartiles": (3, 4, 4)}
 
 
 @pytest.mark.parametrize("text", ["6000", "0x4", "ax4", "5x4", "2x4x6"])
@@ -55,34 +53,6 @@ def test_what_is_missing_is_named(monkeypatch, capsys):
         capsys.readouterr().err
         == "no_such_module: missing; .venv/bin/pip install -e '.[compare]'\n"
     )
-
-
-def test_methods_run_on_one_image_and_a_missing_package_is_named(monkeypatch, capsys):
-    monkeypatch.setattr(other_methods, "SIZE", (16, 8))
-    seen = []
-    there, missing = (
-        other_methods.Other(
-            name,
-            name,
-            {"demosaic": {"method": "bilinear"}},
-            lambda module, mosaic: lambda: seen.append((module.__name__, mosaic.shape)),
-        )
-        for name in ("json", "no_such_module")
-    )
-    (row,) = other_methods.compare_methods(None, 3, [missing, there])
-    assert row.work == "demosaic bilinear: json"
-    assert len(row.ours) == len(row.theirs["other"]) == 3
-    assert set(seen) == {("json", (8, 16))}
-    stderr = capsys.readouterr().err
-    assert (
-        stderr == "demosaic bilinear: no_such_module is skipped: No module named 'no_such_module'\n"
-    )
-
-
-def test_the_methods_that_are_compared_exist():
-    for other in other_methods.OTHERS:
-        stages = other_methods.settings_from({"stages": list(other.stages), **other.stages})
-        assert stages.stages == tuple(other.stages)
 
 
 @pytest.fixture

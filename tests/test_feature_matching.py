@@ -9,7 +9,7 @@ from PIL import Image
 from scipy import ndimage
 
 from clpipe.analysis.matching.scenes import load_scenes
-from tools.compare import judge, matching
+from tools.compare import matching
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("cv2", reason="needs OpenCV, in the extra compare")
@@ -58,7 +58,7 @@ def test_noise_models_are_compared_with_a_camera(scene, tmp_path, monkeypatch, c
         for name, pixels in (("mean", scene), ("real", scene + noise)):
             file = tmp_path / f"camera_{number}_{name}.png"
             Image.fromarray(np.rint(pixels).clip(0, 255).astype(np.uint8)).save(file)
-    monkeypatch.setattr(judge, "STEPS", 2)
+    monkeypatch.setattr(matching, "STEPS", 2)
     words = ["matching", str(tmp_path), "--config", "default", "--json"]
     monkeypatch.setattr(sys, "argv", words)
     matching.main()
@@ -91,7 +91,7 @@ def test_models_are_as_strong_as_the_picture(scene, tmp_path):
         Image.fromarray(np.rint(pixels).clip(0, 255).astype(np.uint8)).save(file)
     own = load_scenes(files[:1], files[1:]).each[0]
     real = matching.strength(own.noise, own)
-    assert matching.strength(judge.iid(own), own) < 0.8 * real  # its channels are independent
-    for source in (judge.iid, judge.intensity_dependent):
+    assert matching.strength(matching.iid(own), own) < 0.8 * real  # its channels are independent
+    for source in (matching.iid, matching.intensity_dependent):
         scaled = matching.as_strong(source)(own)
         assert matching.strength(scaled, own) == pytest.approx(real)

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from clpipe.engine.cpu_target import TARGETS, equivalent_target
-from tools.stress.emulated import EMULATED, measure_emulated, script
-from tools.stress.runtimes import UnavailableError
+from tools.stress.portability import EMULATED, UnavailableError, measure, script
 
 pytestmark = pytest.mark.slow
 
@@ -30,5 +29,5 @@ def test_a_program_that_stands_for_another_passes_its_name_and_all_arguments_on(
 def test_x86_cpus_are_not_tried_with_the_packages_of_another_machine(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
     with pytest.raises(UnavailableError, match=r"packages of x86_64, and this machine is aarch64"):
-        measure_emulated(X86[0], tmp_path, [""] * 5)
+        measure(X86[0], tmp_path, [""] * 4)
     assert not any(tmp_path.iterdir())

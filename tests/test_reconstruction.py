@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from clpipe.inputs.render_cameras import read_views as read_poses
 from tools.reconstruction import experiment as tool
 from tools.reconstruction import multiview, report, stereo
 from tools.reconstruction import pictures as picture_kinds
@@ -138,31 +137,14 @@ def test_pmvs_gets_cameras_whose_first_pixel_is_at_0(tmp_path):
         multiview.run_pmvs(program, tmp_path / "q", views, pictures, **options)
 
 
-def test_colmap_gets_the_cameras_and_the_nearest_as_partners(tmp_path, views):
-    pictures = [np.zeros((4, 6, 3), np.uint8)] * len(views)
-    multiview.write_colmap(tmp_path, views, pictures)
-    for view, pose in zip(views, read_poses(tmp_path / "sparse/0"), strict=True):
-        assert pose.name == f"{view.name}.png"
-        assert (tmp_path / "images" / pose.name).exists()
-        assert np.allclose(pose.values["rotation"], view.r)
-        assert np.allclose(pose.values["translation"], view.t)
-        assert pose.values["cx"] == view.k[0, 2]
-    lines = multiview.partners(views).splitlines()
-    assert lines[2:4] == ["view1.png", "view0.png, view2.png, view4.png"]
-
-
-def test_binary_plys_are_read(tmp_path):
-    fields = [(name, "<f4") for name in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
-    head += "".join(f"property {'float' if t == '<f4' else 'uchar'} {n}\n" for n, t in fields)
-    body = np.array([(1, 2, 3, 4, 5, 6), (7, 8, 9, 10, 11, 12)], fields).tobytes()
-    (tmp_path / "a.ply").write_bytes(head.encode() + b"end_header\n" + body)
-    points, colours = multiview.read_ply(tmp_path / "a.ply")
-    assert points.tolist() == [[1, 2, 3], [7, 8, 9]]
-    assert colours.tolist() == [[4, 5, 6], [10, 11, 12]]
-    (tmp_path / "b.ply").write_bytes(head.encode() + b"end_header\n" + body[:-1])
-    with pytest.raises(multiview.ProgramError, match=r"b\.ply: expected coloured points"):
-        multiview.read_ply(tmp_path / "b.ply")
+@pytest.mark.parametrize("body", ["1 2 3 4 5", "", "1 2 3 4 5 x"])
+def test_a_ply_without_whole_coloured_points_is_named(tmp_path, body):
+    names = ("x", "y", "z", "diffuse_red", "diffuse_green")
+    names += ("diffuse_blue",) if body else ()
+    head = "".join(f"property float {name}\n" for name in names)
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\n{head}end_header\n{body}\n")
+    with pytest.raises(multiview.ProgramError, match=r"a\.ply: expected coloured points"):
+        multiview.read_ply(tmp_path / "a.ply")
 
 
 def test_points_are_drawn_the_nearest_on_top():
@@ -182,15 +164,13 @@ def test_after_ctrl_c_what_was_run_for_all_pictures_is_reported(monkeypatch, cap
     pictures = tool.Pictures(tmp_path, ["a"], [100], range(1))
     textures = (tool.ALL, *tool.TEXTURES)
 
-    def stopped(*_):
-        for threshold, jobs in ((0.7, pictures.all()), (0.9, pictures.all()[:2])):
-            for job in jobs:
-                for texture in textures:
-                    yield tool.PointsRow("PMVS2", "half", threshold, *job, texture, 5, 4)
-        raise KeyboardInterrupt
+    def stopped(program, views, pictures, setting, job):
+        if setting != ("half", 0.7) and job != pictures.all()[0]:
+            raise KeyboardInterrupt
+        return [tool.PointsRow(*setting, *job, texture, 5, 4) for texture in textures]
 
-    monkeypatch.setattr(tool, "compare_points", stopped)
-    rows = tool.points_until_stopped({}, [], pictures)
+    monkeypatch.setattr(tool, "points_of_picture", stopped)
+    rows = tool.compare_points("pmvs2", [], pictures)
     assert {row.threshold for row in rows} == {0.7}
     assert len(rows) == len(pictures.all()) * len(textures)
     text = []

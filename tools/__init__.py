@@ -7,6 +7,7 @@
 - training: trains denoisers on clpipe's pictures.
 - blender: builds the extension and the test render.
 - examples: scripts for users, which import only clpipe.
+- shared: what several groups use; it contains no tool.
 
 Modules import those of other groups by their full names.
 """

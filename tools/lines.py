@@ -14,16 +14,10 @@ from collections import Counter
 from pathlib import Path
 
 from tools import ROOT
+from tools.shared.options import parser_of
 
-IGNORED = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENCODING,
-    tokenize.ENDMARKER,
-}
+IGNORED = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
+IGNORED |= {tokenize.ENCODING, tokenize.ENDMARKER}
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -57,6 +51,7 @@ def counts(root: Path, budgets: dict[str, int]) -> Counter[str]:
 
 def main() -> None:
     """Print each folder's lines and budget."""
+    parser_of(__doc__).parse_args()
     budgets = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["lines"]
     found = counts(ROOT, budgets)
     for name, budget in budgets.items():

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from tools import ROOT
 from tools.names import faults_of
+from tools.shared.options import parser_of
 
 CHECKED = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "clpipe"),
@@ -128,10 +129,12 @@ def faults_in(text: str) -> Iterator[str]:
             yield f"{count} words, of {MOST_WORDS} at most: {sentence[:60]}..."
 
 
-def main(names: list[str]) -> int:
+def main() -> int:
     """Print all faults in files or folders, and return the exit status."""
+    parser = parser_of(__doc__)
+    parser.add_argument("paths", nargs="*", metavar="PATH", default=CHECKED)
     count = 0
-    for name in names or CHECKED:
+    for name in parser.parse_args().paths:
         place = ROOT / name
         files = (
             sorted(f for s in ("*.py", "*.md") for f in place.rglob(s))
@@ -147,4 +150,4 @@ def main(names: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

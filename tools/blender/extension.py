@@ -6,7 +6,6 @@ of its dependencies, chosen by pip for the machine that this runs on.
 Usage: tools/run blender extension [-o clpipe-blender.zip]
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -21,8 +20,10 @@ import clpipe
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.files import built_in_configs
 from clpipe.chain.settings import Settings
+from clpipe.chain.toml import value_text
 from clpipe.commands.cameras import make_and_model
 from tools import ROOT
+from tools.shared.options import parser_of
 
 SOURCE = ROOT / "tools" / "blender" / "source"
 # For each Python, the first Blender that has it, and the first that no longer has it.
@@ -60,15 +61,6 @@ def manifest(python: str, wheels: list[str]) -> dict[str, Any]:
     }
 
 
-def toml(values: dict[str, Any]) -> str:
-    """Format plain values, lists and tables of strings as TOML."""
-    lines = [f"{k} = {json.dumps(v)}" for k, v in values.items() if not isinstance(v, dict)]
-    for name, table in values.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{name}]", toml(table)]
-    return "\n".join(lines) + "\n"
-
-
 def choices() -> dict[str, Any]:
     """Return the panel's choices: clpipe's cameras and configurations, and its defaults."""
     return {
@@ -100,7 +92,8 @@ def build(output: Path, python: str, wheels: list[Path]) -> None:
     shared = [wheel for wheel in wheels if wheel not in private]
     with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
         names = [wheel.name for wheel in shared]
-        archive.writestr("blender_manifest.toml", toml(manifest(python, names)))
+        lines = (f"{k} = {value_text(v)}\n" for k, v in manifest(python, names).items())
+        archive.writestr("blender_manifest.toml", "".join(lines))
         archive.writestr("choices.json", json.dumps(choices(), indent=1))
         archive.write(ROOT / "LICENSE", "LICENSE")
         for path in sorted(SOURCE.glob("*.py")):
@@ -116,16 +109,11 @@ def build(output: Path, python: str, wheels: list[Path]) -> None:
 
 def main() -> int:
     """Build the extension, and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("clpipe-blender.zip"), help="the extension"
-    )
-    parser.add_argument(
-        "--python",
-        choices=BLENDERS,
-        default="3.11",
-        help="Blender's Python version: 3.11, or 3.13 from Blender 5.1 on",
-    )
+    parser = parser_of(__doc__)
+    path = Path("clpipe-blender.zip")
+    parser.add_argument("-o", "--output", type=Path, default=path, help="the extension")
+    text = "Blender's Python version: 3.11, or 3.13 from Blender 5.1 on"
+    parser.add_argument("--python", choices=BLENDERS, default="3.11", help=text)
     options = parser.parse_args()
     if not options.output.absolute().parent.is_dir():
         parser.error(f"{options.output}: the parent folder does not exist; create it")

@@ -19,9 +19,6 @@ from math import pi, radians, sin
 from pathlib import Path
 from typing import Any
 
-import bpy
-from mathutils import Vector
-
 SEED = 7
 Point = tuple[float, float, float]
 
@@ -357,15 +354,15 @@ def render(path: Path, size: tuple[int, int], samples: int) -> None:
     bpy.ops.render.render(write_still=True)
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output", type=Path, help="the EXR file to write")
     parser.add_argument("--size", type=int, nargs=2, default=(960, 640), metavar=("W", "H"))
     parser.add_argument("--samples", type=int, default=512)
     options = parser.parse_args()
+
+    import bpy
+    from mathutils import Vector
+
     build()
     render(options.output, options.size, options.samples)
-
-
-if __name__ == "__main__":
-    main()

@@ -78,33 +78,6 @@ def chart_image() -> Floats:
     return patch_image(linear(chart_patches()))
 
 
-def saturated_image() -> Floats:
-    """Return the patches of :func:`saturated_patches` above ramps and fine textures of their hues.
-
-    The result is a linear render, (640, 384, 3). From row 256 down, each hue has a column: two
-    ramps to black, then stripes of 2 to 4 px and grains of 2 px.
-    """
-    flat = patch_image(saturated_patches())
-    height, width = 6 * SIDE, SIDE
-    y, x = np.mgrid[0:height, 0:width]
-    ramp = BRIGHT[0] * np.linspace(1, 0, SIDE) ** 2
-    generator = np.random.default_rng(0)
-    textured = np.empty((height, ROW, width, 3))
-    for number, hue in enumerate(np.array(HUES, np.float64)):
-        light = np.empty((height, width))
-        for part in range(6):
-            rows = slice(part * SIDE, (part + 1) * SIDE)
-            if part < 2:  # ramps, across and down
-                light[rows] = ramp if part else ramp[:, None]
-            elif part < 5:  # slanted stripes of 2, 3 and 4 px
-                light[rows] = np.where((x + y)[rows] % (2 * part) < part, *BRIGHT)
-            else:
-                grains = generator.uniform(DARK[0], BRIGHT[0], (SIDE // 2, SIDE // 2))
-                light[rows] = grains.repeat(2, 0).repeat(2, 1)
-        textured[:, number] = np.maximum(light[..., None] * hue, DARK[1])
-    return np.concatenate([flat, textured.reshape(height, -1, 3).astype(np.float32)])
-
-
 def patch_places(height: int, patches: int = 24) -> Mask:
     """Return the mask, (height, 384), of the inner halves of an image's patches.
 

@@ -3,7 +3,7 @@
 All pictures are in sRGB levels, 0 to 255.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +44,6 @@ class ColourErrors:
     largest_hue: float  # degrees
     chroma: float  # median ratio to the chart's
 
-    def record(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
-
 
 def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> ColourErrors:
     """Compare the patches of a picture of a ColorChecker with their true colours.
@@ -75,15 +71,6 @@ def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> Col
         largest_hue=float(hue_errors.max()),
         chroma=float(np.median(found_chroma[coloured] / chroma[coloured])),
     )
-
-
-def delta_e(one: NDArray[np.number], two: NDArray[np.number]) -> Doubles:
-    """Return the distance of colours in CIELAB (CIE 1976), pixel by pixel.
-
-    >>> delta_e(np.array([255, 0, 0]), np.array([0, 255, 0])).round(1).tolist()
-    170.6
-    """
-    return np.linalg.norm(cielab(one) - cielab(two), axis=-1)
 
 
 def dots(picture: NDArray[np.number], reference: NDArray[np.number]) -> float:

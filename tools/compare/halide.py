@@ -12,7 +12,6 @@ Both run from memory to memory, on two bytes per pixel for Halide and four for c
 each candidate once, so that other load on the machine affects all of them.
 """
 
-import argparse
 import importlib.util
 
 import numpy as np
@@ -27,30 +26,24 @@ from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.stage import Kind
 from tools.compare.timing import Comparison, Work, interleaved
+from tools.shared.options import count_of, parser_of, sides_of
 
-STAGES = (
-    "normalize",
-    "white_balance",
-    "demosaic",
-    "color_matrix",
-    "sharpen",
-    "tone_curve",
-    "gamma",
-)
+STAGES = ("normalize", "white_balance", "demosaic", "color_matrix")
+STAGES += ("sharpen", "tone_curve", "gamma")
 
 
 def main() -> None:
     """Time both, and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--device")
-    parser.add_argument("--size", default="6000x4000")
-    parser.add_argument("--repeat", type=int, default=15)
+    parser.add_argument("--size", type=sides_of, default=(6000, 4000), metavar="WxH")
+    parser.add_argument("--repeat", type=count_of, default=15, help="rounds [15]")
     options = parser.parse_args()
     if not importlib.util.find_spec("halide"):
         parser.error("this comparison needs Halide: .venv/bin/pip install -e '.[compare]'")
     from tools.compare.halide_chain import AUTOSCHEDULERS, BAND, HalideChain
 
-    width, height = map(int, options.size.split("x"))
+    width, height = options.size
     if width % 2 or height % BAND:
         parser.error(f"--size: the width must be even, and the height a multiple of {BAND}")
     settings = settings_from({"stages": list(STAGES), "demosaic": {"method": "malvar2004"}})
@@ -81,16 +74,9 @@ def main() -> None:
     mine = seconds.pop("clpipe")
     result = Comparison(f"{width}x{height}", width * height / 1e6, mine, seconds)
     rows = [("clpipe", f"{result.speed(mine):.0f}", "1.00", "")]
-    for name in seconds:
-        low, median, high = (1 / ratio for ratio in result.ratios(name))
-        rows.append(
-            (
-                name,
-                f"{result.speed(seconds[name]):.0f}",
-                f"{median:.2f}",
-                f"{high:.2f} to {low:.2f}",
-            )
-        )
+    for name, own in seconds.items():
+        low, median, high = (f"{1 / ratio:.2f}" for ratio in result.ratios(name))
+        rows.append((name, f"{result.speed(own):.0f}", median, f"{high} to {low}"))
     print(f"\n{width}x{height}, {device.info.label}, {cores} processors\n")
     show(("", "MP/s", "over clpipe", "quartiles"), rows)
 

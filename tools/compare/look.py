@@ -9,7 +9,6 @@ measured in the JPEG. The faults of a lens are those of 32 draws of lens=typical
 RENDERs, by default the project's own.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -28,6 +27,8 @@ from clpipe.images.read import read_image
 from clpipe.reference.transfer import inverse_srgb_curve
 from clpipe.scenes.leaves import dead_leaves
 from tools import RENDER
+from tools.shared.options import parser_of
+from tools.shared.tables import markdown
 
 ISOS, CONTRASTS, ANGLES = (100, 400, 1600, 6400, 25600), (10.0, 4.0, 1.5), (5, 20, 70, 85)
 FRAMES = 16
@@ -173,19 +174,17 @@ def print_tables(settings: Settings, renders: Sequence[str]) -> None:
         rows.setdefault("texture at 0.3 cycles/px", []).append(f"{texture(Camera(at), leaves):.2f}")
         width = chroma_width(Camera(at), encoding)
         rows.setdefault("chroma edge, 10 to 90 %, px", []).append(f"{width:.1f}")
-    print(f"| {' | '.join(heading)} |", f"|{'---|' * len(heading)}", sep="\n")
-    for name, cells in sorted(rows.items()):
-        real = next((text for figure, text in REAL.items() if name.startswith(figure)), "")
-        print(f"| {' | '.join([name, *cells, real])} |")
-    print("\n| | clpipe | real cameras |\n|---|---|---|")
-    for name, text in {**lens_faults(settings), **tone(settings, renders)}.items():
-        print(f"| {name} | {text} | {REAL.get(name, '')} |")
+    for name, cells in rows.items():
+        cells.append(next((text for figure, text in REAL.items() if name.startswith(figure)), ""))
+    print(markdown(heading, ([name, *cells] for name, cells in sorted(rows.items()))))
+    found = {**lens_faults(settings), **tone(settings, renders)}
+    every = ([name, text, REAL.get(name, "")] for name, text in found.items())
+    print(f"\n{markdown(['', 'clpipe', 'real cameras'], every)}")
 
 
 def main() -> None:
     """Measure, and print Markdown."""
-    formatter = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
+    parser = parser_of(__doc__)
     parser.add_argument("renders", nargs="*", default=[str(RENDER)], metavar="RENDER")
     parser.add_argument("-c", "--config", action="append", default=[])
     options = parser.parse_args()

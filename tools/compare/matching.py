@@ -5,8 +5,8 @@
 FOLDER contains pairs of a camera's picture and the mean of many pictures of the same scene:
 NAME_real.png and NAME_mean.png. The tool adds noise of several models to each mean:
 
-- clpipe's noise for each configuration, at the ISO at which its luma noise is as strong as the
-  picture's (see tools/judge);
+- clpipe's noise for each configuration: the tool converts the mean to linear light and develops it
+  at the ISO at which its luma noise is as strong as the picture's;
 - independent Gaussian noise (iid), or with the picture's variance at each luma
   (intensity-dependent). Both are scaled to the picture's luma noise, because detectors see luma.
 
@@ -24,25 +24,26 @@ It needs the extra "compare" (.venv/bin/pip install -e '.[compare]').
 import importlib.util
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from clpipe.analysis.matching.columns import Noise, figures_of
-from clpipe.analysis.matching.scenes import Scene
+from clpipe.analysis.matching.scenes import Scene, load_scenes
+from clpipe.analysis.matching.search import target_of
 from clpipe.analysis.matching.simulation import Simulator
-from clpipe.base.types import Array, Doubles
+from clpipe.base.types import Array
+from clpipe.chain.files import load_settings
+from clpipe.chain.settings import overlay
 from clpipe.engine.device import open_device
-from tools.compare.judge import (
-    CONFIGS,
-    iid,
-    intensity_dependent,
-    parser_of,
-    read_pairs,
-    simulated_by,
-)
+from clpipe.images.jpeg import JpegEncoding
+from tools.shared.options import parser_of
+from tools.shared.pairs import find_pairs
 
+CONFIGS = ("default", "nikon-d800-jpeg", "canon-5d3-jpeg")
+STEPS = 4  # iterations of the search for an ISO
 RADIUS = 2.0  # px
 REAL = "real"
 DETECTORS = ("SIFT", "ORB")
@@ -58,6 +59,49 @@ class Matching(NamedTuple):
 def strength(noise: Noise, scene: Scene) -> float:
     """Return the rms of luma noise in flat areas of a scene, in levels of 255."""
     return figures_of(noise, scene.places())["rms"]
+
+
+def simulated_by(config: str, simulator: Simulator) -> Callable[[Scene], Noise]:
+    """Return a function that simulates a scene's noise, as strong as the real noise."""
+    settings = load_settings(config)
+    low, high = settings.isos().low, settings.isos().high
+    output = settings.output
+    written = JpegEncoding(output.jpeg_quality, output.jpeg_subsampling)
+
+    def noise(scene: Scene) -> Noise:
+        scene = replace(scene, jpeg=scene.jpeg or written)
+        target = target_of(scene)
+        iso = float(np.sqrt(low * high))
+        for _ in range(STEPS):
+            simulated = simulator.noise(overlay(settings, {"iso": iso}), scene, "iso", 1)
+            ratio = target.figures["rms"] / figures_of(simulated, target.places)["rms"]
+            iso = float(np.clip(iso * ratio**2, low, high))
+        return simulator.noise(overlay(settings, {"iso": iso}), scene, "compared", 1)
+
+    return noise
+
+
+def iid(scene: Scene) -> Noise:
+    """Return independent Gaussian noise with the real noise's variance in each channel."""
+    real = scene.noise
+    sigma = real.rgb[:, scene.flat].std((0, 1))
+    normals = np.random.default_rng(0).normal(size=real.rgb[:1].shape)
+    return Noise(normals * sigma, real.level)
+
+
+def intensity_dependent(scene: Scene) -> Noise:
+    """Return independent Gaussian noise with the real noise's variance at each luma."""
+    real, mask = scene.noise, scene.flat
+    bins = (real.level // 16).astype(int)
+    sigma = np.zeros((17, 3))
+    for number in range(17):
+        at = mask & (bins == number)
+        sigma[number] = real.rgb[:, at].std((0, 1)) if at.sum() > 200 else np.nan
+    for channel in sigma.T:
+        known = ~np.isnan(channel)
+        channel[:] = np.interp(np.arange(17), np.flatnonzero(known), channel[known])
+    normals = np.random.default_rng(0).normal(size=real.rgb[:1].shape)
+    return Noise(normals * sigma[bins], real.level)
 
 
 def as_strong(noise_of: Callable[[Scene], Noise]) -> Callable[[Scene], Noise]:
@@ -107,40 +151,32 @@ def compared(detector: str, clean: Array, noisy: Array) -> Matching:
 
 def report(folder: Path, configs: Sequence[str]) -> dict[str, Any]:
     """Return all results as JSON values."""
-    pairs = read_pairs(folder)
+    pairs = find_pairs(folder)
+    scenes = [load_scenes([str(each.real)], [str(each.mean)]).each[0] for each in pairs]
     simulator = Simulator(open_device(None))
     sources: dict[str, Callable[[Scene], Noise]] = {REAL: lambda scene: scene.noise}
     sources |= {config: simulated_by(config, simulator) for config in configs}
     sources |= {"iid": as_strong(iid), "intensity-dependent": as_strong(intensity_dependent)}
-    figures: dict[str, Doubles] = {}  # (picture, detector, figure)
-    strengths = {}
+    models: dict[str, Any] = {}
+    real = np.empty(0)
     for source, noise_of in sources.items():
         rows, levels = [], []
-        for scene in (pair.scene for pair in pairs):
+        for scene in scenes:
             noise = noise_of(scene)
             noisy = scene.frames[0] if source == REAL else scene.mean + noise.rgb[0]
             both = grey(scene.mean), grey(noisy)
             rows.append([compared(detector, *both) for detector in DETECTORS])
             levels.append(strength(noise, scene))
-        figures[source], strengths[source] = np.array(rows), float(np.mean(levels))
-    models = {
-        source: {
-            "luma_rms": strengths[source],
-            **{
-                detector: {
-                    name: {
-                        "mean": float(own[:, d, k].mean()),
-                        "error": float(abs(own - figures[REAL])[:, d, k].mean()),
-                        "each": own[:, d, k].tolist(),
-                    }
-                    for k, name in enumerate(Matching._fields)
-                }
-                for d, detector in enumerate(DETECTORS)
-            },
-        }
-        for source, own in figures.items()
-    }
-    return {"pictures": [pair.scene.name for pair in pairs], "models": models}
+        figures = np.array(rows)  # (picture, detector, figure)
+        real = figures if source == REAL else real
+        models[source] = {"luma_rms": float(np.mean(levels))}
+        for d, detector in enumerate(DETECTORS):
+            for k, name in enumerate(Matching._fields):
+                own = figures[:, d, k]
+                error = float(abs(own - real[:, d, k]).mean())
+                figure = {"mean": float(own.mean()), "error": error, "each": own.tolist()}
+                models[source].setdefault(detector, {})[name] = figure
+    return {"pictures": [scene.name for scene in scenes], "models": models}
 
 
 def table(found: Mapping[str, Any]) -> str:
@@ -160,7 +196,11 @@ def table(found: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Compare the noise models, and print the table."""
-    parser = parser_of(__doc__ or "")
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    repeated = f"a configuration to compare; may be repeated [{', '.join(CONFIGS)}]"
+    parser.add_argument("--config", action="append", help=repeated)
+    parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     if not importlib.util.find_spec("cv2"):
         parser.error("OpenCV is missing; .venv/bin/pip install -e '.[compare]'")

@@ -1,6 +1,6 @@
 """Compare the speed of clpipe's default chain with the same work in OpenCV and NumPy.
 
-    tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...] [--methods]
+    tools/run compare opencv [--device N] [--arrays WxH ...] [--files COUNTxWxH ...]
 
 It needs the extra "compare" (.venv/bin/pip install -e '.[compare]'). opencv_chain.py lists
 the OpenCV functions that replace each stage, and where OpenCV does less work. The OpenCV script
@@ -17,8 +17,6 @@ script decodes with the OpenEXR package, which is at least as fast as cv2.imread
 cv2.imencode, which is faster than Pillow. It uses the fastest of several numbers of threads. Links
 to a few renders replace many files.
 
-Methods: see methods.py for the comparison with colour-demosaicing, scikit-image and HDRutils.
-
 A round runs each candidate once, so that other load on the machine affects all of them. Speeds are
 medians. Ratios are computed within rounds; the tables show their median and quartiles. First, both
 programs develop the test image, and the script compares their pictures and noise.
@@ -26,13 +24,10 @@ programs develop the test image, and the script compares their pictures and nois
 
 import argparse
 import importlib.util
-import json
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -59,6 +54,7 @@ from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.writer import OutputWriter
 from tools import RENDER
 from tools.compare.timing import Comparison, Work, interleaved
+from tools.shared.options import count_of, numbers_of, parser_of
 
 NEEDED = ("cv2", "OpenEXR")
 WHOLE, BANDS = "opencv_whole", "opencv_bands"
@@ -204,16 +200,10 @@ class Files:
         self.threads = min(seconds, key=seconds.__getitem__)
 
 
-@contextmanager
-def files_of(device: Device, workload: Workload) -> Iterator[Files]:
-    """A load of files in a temporary folder."""
-    with tempfile.TemporaryDirectory(prefix="clpipe-compare-") as name:
-        yield Files(device, workload, Path(name))
-
-
 def compare_files(device: Device, workload: Workload, repeat: int) -> Comparison:
     """Files to files."""
-    with files_of(device, workload) as files:
+    with tempfile.TemporaryDirectory(prefix="clpipe-compare-") as name:
+        files = Files(device, workload, Path(name))
         files.clear()
         files.clpipe(count=8)  # compiles kernels, and loads the files into the page cache
         files.choose_threads()
@@ -231,35 +221,27 @@ def compare_files(device: Device, workload: Workload, repeat: int) -> Comparison
     )
 
 
-def size_of(text: str) -> tuple[int, int]:
-    """Parse WxH as two even numbers."""
-    width, height = numbers_of(text, 2)
-    return width, height
-
-
 def load_of(text: str) -> Workload:
-    """COUNTxWxH."""
-    return Workload(*numbers_of(text, 3))
-
-
-def rounds_of(text: str) -> int:
-    """Parse a number of rounds, at least one."""
-    if not text.isdecimal() or not int(text):
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number from 1 on")
-    return int(text)
-
-
-def numbers_of(text: str, count: int) -> list[int]:
-    """Parse whole numbers separated by x; widths and heights must be even.
+    """Parse COUNTxWIDTHxHEIGHT, with an even width and height.
 
     Raises:
         argparse.ArgumentTypeError: the text has another form.
     """
-    words = text.split("x")
-    if len(words) != count or not all(w.isdecimal() and int(w) for w in words):
-        form = "x".join(("COUNT", "WIDTH", "HEIGHT")[-count:])
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected {form}")
-    numbers = [int(word) for word in words]
+    return Workload(*even(numbers_of(text, "COUNTxWIDTHxHEIGHT"), text))
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Parse WIDTHxHEIGHT, both even.
+
+    Raises:
+        argparse.ArgumentTypeError: the text has another form.
+    """
+    width, height = even(numbers_of(text, "WIDTHxHEIGHT"), text)
+    return width, height
+
+
+def even(numbers: list[int], text: str) -> list[int]:
+    """Check that the last two numbers of a text are even."""
     if any(number % 2 for number in numbers[-2:]):
         raise argparse.ArgumentTypeError(f"found {text!r}; the script needs even sizes")
     return numbers
@@ -267,39 +249,24 @@ def numbers_of(text: str, count: int) -> list[int]:
 
 def main() -> int:
     """Compare, and print the tables."""
-    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--device", metavar="N|NAME", help="like clpipe's --device")
-    parser.add_argument(
-        "--arrays",
-        nargs="*",
-        type=size_of,
-        metavar="WxH",
-        default=[(3000, 2000), (6000, 4000)],
-        help="sizes of images in memory; without values, skip this comparison",
-    )
-    parser.add_argument(
-        "--files",
-        nargs="*",
-        type=load_of,
-        metavar="COUNTxWxH",
-        default=[Workload(20, 6000, 4000), Workload(1000, 512, 512), Workload(200, 1920, 1080)],
-        help="numbers and sizes of files; none for no such comparison",
-    )
-    parser.add_argument(
-        "--repeat", type=int, default=5, metavar="N", help="rounds of each comparison"
-    )
-    parser.add_argument("--methods", action="store_true", help="compare single methods as well")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser = parser_of(__doc__)
+    add = parser.add_argument
+    add("--device", metavar="N|NAME", help="like clpipe's --device")
+    sizes = [(3000, 2000), (6000, 4000)]
+    text = "sizes of images in memory; without values, skip this comparison"
+    add("--arrays", nargs="*", type=size_of, metavar="WxH", default=sizes, help=text)
+    loads = [Workload(20, 6000, 4000), Workload(1000, 512, 512), Workload(200, 1920, 1080)]
+    text = "numbers and sizes of files; none for no such comparison"
+    add("--files", nargs="*", type=load_of, metavar="COUNTxWxH", default=loads, help=text)
+    add("--repeat", type=count_of, default=5, metavar="N", help="rounds of each comparison [5]")
     options = parser.parse_args()
-    if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
-        print(
-            f"{', '.join(missing)}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr
-        )
-        return 1
     try:
+        if missing := [name for name in NEEDED if not importlib.util.find_spec(name)]:
+            text = f"{', '.join(missing)}: missing; .venv/bin/pip install -e '.[compare]'"
+            raise ClpipeError(text)
         return compare(options)
     except ClpipeError as error:
-        print(f"compare_opencv: {error}", file=sys.stderr)
+        print(error, file=sys.stderr)
         return 1
 
 
@@ -319,22 +286,6 @@ def compare(options: argparse.Namespace) -> int:
     for size in options.arrays:
         rows += compare_arrays(device, *size, options.repeat)
     rows += [compare_files(device, workload, options.repeat) for workload in options.files]
-    methods = []
-    if options.methods:
-        from tools.compare.methods import compare_methods
-
-        methods = compare_methods(device, options.repeat)
-    record = {
-        "device": device.info.label,
-        "opencv": cv2.__version__,
-        "processors": available_processors(),
-        "likeness": alike._asdict(),
-        "chain": [row.record() for row in rows],
-        "methods": [row.record() for row in methods],
-    }
-    if options.json:
-        print(json.dumps(record, indent=2))
-        return 0
     print(
         f"{device.info.label}, OpenCV {cv2.__version__}, {available_processors()} CPUs\n"
         f"pictures of the test image differ by {alike.difference:.1f} levels of 255 on average; "
@@ -342,13 +293,6 @@ def compare(options: argparse.Namespace) -> int:
     )
     if rows:
         show(HEADINGS, [row.cells() for row in rows], left=1)
-    if methods:
-        print()
-        show(
-            ("method", "clpipe MP/s", "other MP/s", "ratio", "quartiles"),
-            [row.cells() for row in methods],
-            left=1,
-        )
     return 0
 
 

@@ -15,7 +15,6 @@ of C / (CPU time per image), N / (locked time per image) and 1 / (parent's time 
 assumes that processors are as fast together as singly, and that disk and memory keep up.
 """
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -28,6 +27,8 @@ from clpipe.batch.processes import default_processes
 from clpipe.chain.request import Request
 from clpipe.engine.device import open_device
 from clpipe.images.claims import mosaic_claim
+from tools.shared.options import count_of, parser_of, sides_of
+from tools.shared.tables import markdown
 
 COUNTS = (1, 2, 4)
 FEW = 40  # images, to measure the time to start
@@ -111,18 +112,16 @@ def modelled(cost: Cost, lock: float, processors: int, processes: int) -> float:
 
 def main() -> None:
     """Measure, and print the tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--sizes", default="512x512,640x480,1920x1080")
-    parser.add_argument("--images", type=int, default=600)
-    parser.add_argument("--processors", type=int, default=64)
+    parser = parser_of(__doc__)
+    parser.add_argument("--sizes", default="512x512,640x480,1920x1080", help="[%(default)s]")
+    parser.add_argument("--images", type=count_of, default=600, help="of each size [600]")
+    parser.add_argument("--processors", type=count_of, default=64, help="of the model [64]")
     options = parser.parse_args()
     here = available_processors()
     print(f"{here} processors; {options.images} images; CPU times in ms per image\n")
-    print("| size | locked, at most | processes | workers | parent | images/s here |")
-    print("|---|---|---|---|---|---|")
-    models = []
+    rows, models = [], []
     for text in options.sizes.split(","):
-        width, height = map(int, text.split("x"))
+        width, height = sides_of(text)
         with tempfile.TemporaryDirectory(prefix="clpipe-scale-") as name:
             folder = Path(name)
             write_renders(folder / "in", Workload(options.images, width, height))
@@ -130,16 +129,18 @@ def main() -> None:
             lock = locked_time(Workload(options.images, width, height))
             costs = {count: cost_of(folder, options.images, count) for count in COUNTS}
         for count, cost in costs.items():
-            numbers = f"{cost.cpu:.2f} | {cost.parent:.2f} | {1e3 / cost.elapsed:.0f}"
-            print(f"| {text} | {lock:.2f} | {count} | {numbers} |", flush=True)
+            numbers = f"{cost.cpu:.2f}", f"{cost.parent:.2f}", f"{1e3 / cost.elapsed:.0f}"
+            rows.append([text, f"{lock:.2f}", count, *numbers])
         claim = mosaic_claim(width, height)
         usual = default_processes(10**6, claim, options.processors)
         single = modelled(costs[1], lock, options.processors, 1)
         shared = modelled(costs[here if here in costs else 2], lock, options.processors, usual)
-        models.append(f"| {text} | {single:.0f} | {usual} | {shared:.0f} |")
+        models.append([text, f"{single:.0f}", usual, f"{shared:.0f}"])
+    heads = ["size", "locked, at most", "processes", "workers", "parent", "images/s here"]
+    print(markdown(heads, rows))
     print(f"\nModel of {options.processors} processors:\n")
-    print("| size | one process, images/s | processes by default | images/s |")
-    print("\n".join(["|---|---|---|---|", *models]))
+    heads = ["size", "one process, images/s", "processes by default", "images/s"]
+    print(markdown(heads, models))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -56,14 +55,6 @@ class Comparison:
             low, median, high = self.ratios(name)
             cells += [format_speed(self.speed(seconds)), f"{median:.2f}", f"{low:.2f} {high:.2f}"]
         return cells
-
-    def record(self) -> dict[str, Any]:
-        """Return the comparison as JSON values."""
-        others = {
-            name: {"mp_per_s": self.speed(seconds), "ratio_quartiles": self.ratios(name)}
-            for name, seconds in self.theirs.items()
-        }
-        return {"work": self.work, "clpipe": {"mp_per_s": self.speed(self.ours)}, **others}
 
 
 def format_speed(speed: float) -> str:

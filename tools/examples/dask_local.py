@@ -7,14 +7,20 @@ All arguments go to clpipe run. On one machine, clpipe run without Dask is simpl
 shows what a cluster needs. If a worker dies (try kill -9), no image is lost.
 """
 
-import sys
-
-from distributed import LocalCluster
+import argparse
 
 from clpipe.base.processors import available_processors
 from clpipe.commands.main import main
 
 if __name__ == "__main__":  # the workers import this file
+    parser = argparse.ArgumentParser(
+        description="Run clpipe on a Dask cluster of this machine.",
+        epilog="All arguments go to clpipe run.",
+    )
+    arguments = parser.parse_known_args()[1]
+
+    from distributed import LocalCluster
+
     processors = available_processors()
     # Each process has its own OpenCL device. Its threads decode and encode.
     with LocalCluster(
@@ -22,4 +28,4 @@ if __name__ == "__main__":  # the workers import this file
         threads_per_worker=min(4, processors),
         dashboard_address=":0",
     ) as cluster:
-        main(["run", *sys.argv[1:], "--dask", cluster.scheduler_address])
+        main(["run", *arguments, "--dask", cluster.scheduler_address])

@@ -12,14 +12,21 @@ hosts need:
 - OpenCL devices of the same kind
 """
 
+import argparse
 import os
 import sys
-
-from distributed import SSHCluster
 
 from clpipe.commands.main import main
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description="Run clpipe on a Dask cluster of the machines in HOSTS.",
+        epilog="All arguments go to clpipe run.",
+    )
+    arguments = parser.parse_known_args()[1]
+
+    from distributed import SSHCluster
+
     first, *others = os.environ["HOSTS"].split()
     with SSHCluster(
         [first, first, *others],  # the first is for the scheduler
@@ -27,4 +34,4 @@ if __name__ == "__main__":
         worker_options={"nthreads": 4},  # for decoding and encoding
         scheduler_options={"port": 8786, "dashboard_address": ":0"},
     ) as cluster:
-        main(["run", *sys.argv[1:], "--dask", cluster.scheduler_address])
+        main(["run", *arguments, "--dask", cluster.scheduler_address])

@@ -12,11 +12,8 @@ import argparse
 import json
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
-mi.set_variant("scalar_rgb")
-T = mi.ScalarTransform4f
 WARM_AND_COLD = ([6, 4.5, 3], [1, 1.2, 1.5])
 FOV = 40.0  # degrees, across
 
@@ -108,4 +105,9 @@ if __name__ == "__main__":
     parser.add_argument("--size", type=int, nargs=2, default=(480, 320), metavar=("W", "H"))
     parser.add_argument("--samples", type=int, default=128)
     options = parser.parse_args()
+
+    import mitsuba as mi
+
+    mi.set_variant("scalar_rgb")
+    T = mi.ScalarTransform4f
     main(options.folder, options.views, options.size, options.samples)

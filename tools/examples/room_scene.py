@@ -10,11 +10,9 @@ The scene is built only from code, with meshes and procedural materials. One uni
 points up.
 """
 
+import argparse
 import sys
 from math import radians
-
-import bpy
-from mathutils import Vector
 
 WHITE, WARM, COLD = (0.8, 0.8, 0.8, 1), (1, 0.75, 0.5, 1), (0.6, 0.8, 1, 1)
 
@@ -92,5 +90,14 @@ def room():
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Make a small scene for clpipe dataset.")
+    parser.add_argument("file", metavar="FILE.blend", help="the file to write")
+    # Blender's own options are before "--".
+    words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    path = parser.parse_args(words).file
+
+    import bpy
+    from mathutils import Vector
+
     room()
-    bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
+    bpy.ops.wm.save_as_mainfile(filepath=path)

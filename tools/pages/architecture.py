@@ -8,7 +8,6 @@ import re
 import textwrap
 import tomllib
 from collections.abc import Iterator, Sequence
-from html import escape
 from itertools import chain
 
 import grimp
@@ -18,6 +17,8 @@ from clpipe.chain.settings import Settings
 from clpipe.commands.plan import plan_record
 from clpipe.engine.plan import make_plan
 from tools import ROOT
+from tools.shared.drawing import box, svg, text
+from tools.shared.options import parser_of
 
 DOCS = ROOT / "docs"
 STYLE = """<style>
@@ -34,25 +35,6 @@ text { fill: #e4e6e8; } text.pale { fill: #a0a8b0; }
 }
 </style>
 """
-
-
-def svg(width: int, height: int, parts: Sequence[str]) -> str:
-    """Return an SVG with its own background, readable on pages of any colour."""
-    frame = f'<rect width="{width}" height="{height}" rx="6" class="paper"/>'
-    size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
-    lines = [f'<svg xmlns="http://www.w3.org/2000/svg" {size}>', STYLE + frame, *parts, "</svg>"]
-    return "\n".join(lines) + "\n"
-
-
-def text(x: float, y: float, line: str, kind: str = "", more: str = "") -> str:
-    """Return a line of text, vertically centred on y."""
-    return f'<text x="{x:g}" y="{y:g}" class="{kind}"{more}>{escape(line)}</text>'
-
-
-def box(x: float, y: float, width: float, height: float, colour: str, more: str = "") -> str:
-    """Return a rectangle in one of the colours of STYLE."""
-    place = f'x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}"'
-    return f'<rect {place} class="{colour}"{more}/>'
 
 
 def layers() -> list[list[str]]:
@@ -107,7 +89,7 @@ def packages_picture() -> str:
             for j, other in enumerate(names)
             if (name, other) in pairs and name != other
         ]
-    return svg(width, height, parts)
+    return svg(width, height, STYLE, parts)
 
 
 def images_of(text: str) -> list[tuple[str, tuple[int, ...]]]:
@@ -163,7 +145,7 @@ def launches_picture() -> str:
         parts.append(text(x + step / 2, (begin + end) / 2, kind, "middle", turned))
     bottom = tops[-1]
     parts.append(text(36, bottom + 20, f"the result: {launches[-1]['writes']}", "pale"))
-    return svg(width, bottom + 40, parts)
+    return svg(width, bottom + 40, STYLE, parts)
 
 
 def reason_of(launch: dict[str, str]) -> str:
@@ -179,6 +161,7 @@ PICTURES = {"packages.svg": packages_picture, "launches.svg": launches_picture}
 
 def main() -> None:
     """Write the pictures."""
+    parser_of(__doc__).parse_args()
     for name, picture in PICTURES.items():
         (DOCS / name).write_text(picture(), "utf-8")
 

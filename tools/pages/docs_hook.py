@@ -21,9 +21,15 @@ from clpipe.images.vocabularies import CLIP, DNG, JPEG, LAYERS, OPENEXR, PNG, TI
 from clpipe.inputs.annotation_keys import BOP, COCO, KITTI
 from clpipe.inputs.camera_keys import COLMAP, TRANSFORMS
 from clpipe.stage import Method
+from clpipe.stages import DEFAULT_CHAIN
 from tools import ROOT
+from tools.shared.tables import markdown
 
 NOTEBOOK = "first_steps"
+# Units of a camera's values, and those that its table does not list.
+UNITS = dict.fromkeys(("black_level", "white_level"), "DN")
+UNITS |= dict.fromkeys(("full_well", "dsnu", "hot_pixel_level"), "e-")
+NOT_LISTED = ("name", "make", "model", "aliases", "iso_range", "noise", "sources")
 VOCABULARIES = (OPENEXR, LAYERS, PNG, TIFF, JPEG, DNG, CLIP, TRANSFORMS, COLMAP, COCO, BOP, KITTI)
 
 
@@ -50,15 +56,9 @@ def json_of(*command: str) -> Any:
     return json.loads(result.output)
 
 
-def cell(text: object) -> str:
-    """Escape text for a cell of a table."""
-    return str(text).replace("|", "\\|")
-
-
-def table(headings: list[str], rows: Sequence[Sequence[object]]) -> str:
-    """Format a table in Markdown."""
-    lines: list[Sequence[object]] = [headings, ["---"] * len(headings), *rows]
-    return "\n".join("| " + " | ".join(map(cell, line)) + " |" for line in lines) + "\n"
+def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Format a table in Markdown, with a line break."""
+    return markdown(headings, rows) + "\n"
 
 
 def code(text: object) -> str:
@@ -120,8 +120,12 @@ def _statement_rows(vocabulary: Vocabulary) -> list[list[object]]:
 
 def stages_page() -> str:
     """Generate the page of all stages with their methods and parameters."""
-    records = json_of("stages")
-    default = [step["stage"] for step in default_chain()]
+    records, rows = json_of("stages"), []
+    for record in records:
+        name = record["name"]
+        link = f"[`{name}`](#{name})" + ("" if name in DEFAULT_CHAIN else " \\*")
+        methods = ", ".join(code(method["name"]) for method in record["methods"])
+        rows.append([link, kinds(record), methods, record["summary"]])
     parts = [
         "# Stages and methods\n\n"
         "This page is generated from the declarations of the stages. `clpipe stages NAME` prints "
@@ -135,30 +139,11 @@ def stages_page() -> str:
         "- *mosaic*: one plane of signal, 0 = black level, 1 = white level\n"
         "- *raw*: the mosaic in DN\n"
         "- *display*: 0 to 1, encoded for a screen\n",
-        table(
-            ["stage", "image", "methods", "what it does"],
-            [
-                [
-                    f"[`{r['name']}`](#{r['name']})" + ("" if r["name"] in default else " \\*"),
-                    kinds(r),
-                    ", ".join(code(m["name"]) for m in r["methods"]),
-                    r["summary"],
-                ]
-                for r in records
-            ],
-        ),
+        table(["stage", "image", "methods", "what it does"], rows),
         "\\* not in the default chain\n",
         *(stage_part(record) for record in records),
     ]
     return "\n".join(parts)
-
-
-def default_chain() -> list[dict[str, Any]]:
-    """Return the stages of the default chain from the plan's TOML."""
-    import tomllib
-
-    result = CliRunner().invoke(main, ["plan", "--toml"], catch_exceptions=False)
-    return [{"stage": name} for name in tomllib.loads(result.output)["stages"]]
 
 
 def kinds(record: dict[str, Any]) -> str:
@@ -180,15 +165,11 @@ def stage_part(record: dict[str, Any]) -> str:
             if text.strip(" .").lower() != each["summary"].strip(" .").lower():
                 parts.append(f"{text}\n")
         if each["parameters"]:
-            parts.append(
-                table(
-                    ["parameter", "default", "unit", "allowed", "meaning"],
-                    [
-                        [code(p["name"]), p["default"], p["unit"], p["allowed"], p["text"]]
-                        for p in each["parameters"]
-                    ],
-                )
-            )
+            rows = [
+                [code(p["name"]), p["default"], p["unit"], p["allowed"], p["text"]]
+                for p in each["parameters"]
+            ]
+            parts.append(table(["parameter", "default", "unit", "allowed", "meaning"], rows))
         parts.append(f"Source: {sources(method)}\n")
     return "\n".join(parts)
 
@@ -209,11 +190,6 @@ def figure(value: object) -> str:
     return str(value)
 
 
-def nowrap(text: str) -> str:
-    """Make the hyphens of a number non-breaking."""
-    return text.replace("-", "\N{NON-BREAKING HYPHEN}")
-
-
 def cameras_page() -> str:
     """Generate the page of built-in cameras: noise at every measured ISO, and sources."""
     parts = [
@@ -229,18 +205,10 @@ def cameras_page() -> str:
         title = model if model.startswith(make) else f"{make} {model}"
         also = f" ({', '.join(camera['aliases'])})" if camera["aliases"] else ""
         parts.append(f"## {camera['name']}\n\n{title}{also}, ISO {low:g} to {high:g}.\n")
-        units = {
-            "black_level": "DN",
-            "white_level": "DN",
-            "full_well": "e-",
-            "dsnu": "e-",
-            "hot_pixel_level": "e-",
-        }
-        skip = ("name", "make", "model", "aliases", "iso_range", "noise", "sources")
         rows: list[list[object]] = [
-            [code(key), figure(value), units.get(key, "") if value is not None else ""]
+            [code(key), figure(value), UNITS.get(key, "") if value is not None else ""]
             for key, value in camera.items()
-            if key not in skip
+            if key not in NOT_LISTED
         ]
         parts.append(table(["", "value", "unit"], rows))
         headings = ["ISO", "a", "b", "system_gain, DN/e-", "read_noise, e-", "adc_noise, DN"]
@@ -250,7 +218,8 @@ def cameras_page() -> str:
             signal, emva = noise["signal"], noise["emva1288"]
             values = [noise["iso"], signal["a"], signal["b"], *emva.values()]
             values += [noise["dark_noise"], noise["row_noise"], noise["column_noise"]]
-            rows.append([nowrap(figure(float(value))) for value in values])
+            numbers = (figure(float(value)) for value in values)
+            rows.append([text.replace("-", "\N{NON-BREAKING HYPHEN}") for text in numbers])
         parts.append(table(headings, rows))
         parts.append("Sources:\n")
         parts += [f"- `{key}`: {text}" for key, text in camera["sources"].items()]

@@ -16,7 +16,6 @@ raw_demosaicing, and adds the raw's picture as a column to the figure with the n
 (raw_iso100 or raw_iso1600). docs/paper.md explains the figures.
 """
 
-import argparse
 import json
 import math
 import shlex
@@ -27,19 +26,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from clpipe.analysis.comparison import Comparison, Row, compare
-from clpipe.analysis.comparison_plot import METADATA, STYLE, draw
-from clpipe.analysis.matching.columns import MAX_LAG
+from clpipe.analysis.comparison_plot import draw
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import WHOLE, load_picture
-from clpipe.analysis.spatial import LAGS, radial_spectrum
+from clpipe.analysis.spatial import LAGS
 from clpipe.analysis.statistics import Channel
 from clpipe.base.errors import ClpipeError
 from tools import RENDER
+from tools.shared.options import parser_of
+from tools.shared.plots import caption, caption_spectrum, save, spectrum
 
 SUFFIXES = (".pdf", ".png")
 LEVELS = 255
@@ -214,7 +212,7 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
     }
     sheet = Figure(figsize=(7.5, 6), layout="constrained")
     sheet.suptitle(title, fontsize=10)
-    (of_raw, of_picture), (lags, spectrum) = sheet.subplots(2, 2)
+    (of_raw, of_picture), (lags, power) = sheet.subplots(2, 2)
     of_raw.plot(
         raw.intensity.mean, raw.intensity.sigma, "o", color="black", markersize=4, label="measured"
     )
@@ -227,36 +225,21 @@ def statistics(picture: Path, figure: Path, title: str) -> None:
         curve, table = one.intensity, one.autocorrelation
         of_picture.plot(curve.mean * LEVELS, curve.sigma * LEVELS, "o-", markersize=3, label=label)
         lags.plot(range(LAGS + 1), table[LAGS, LAGS:], "o-", markersize=3, label=label)
-        near = slice(LAGS - MAX_LAG, LAGS + MAX_LAG + 1)
-        spectrum.plot(*radial_spectrum(table[near, near], 0.5, 16), label=label)
+        power.plot(*spectrum(table), label=label)
     caption(of_picture, "Picture: noise by intensity", "luma, levels", "sigma of luma, levels")
     caption(lags, "Picture: autocorrelation of luma", "px to the right", "correlation")
-    caption(
-        spectrum, "Picture: power spectrum of luma", "cycles per pixel", "power; independent: 1"
-    )
-    spectrum.set_yscale("log")
-    spectrum.yaxis.set_minor_formatter("")
-    spectrum.set_yticks(ticks := (0.2, 0.5, 1, 2, 5, 10), [f"{tick:g}" for tick in ticks])
+    caption_spectrum(power, "Picture: power spectrum of luma")
     for axes in (of_raw, of_picture):
         axes.set_ylim(bottom=0)
-    with rc_context(STYLE):
-        for suffix in SUFFIXES:
-            sheet.savefig(figure.with_suffix(suffix), dpi=110, metadata=METADATA[suffix])
-
-
-def caption(axes: Axes, title: str, x_label: str, y_label: str) -> None:
-    """Set the titles, grid and legend of a plot."""
-    axes.set_title(title, fontsize=9)
-    axes.set_xlabel(x_label, fontsize=8)
-    axes.set_ylabel(y_label, fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    for axes in sheet.axes:
+        axes.legend(fontsize=7)
+    for suffix in SUFFIXES:
+        save(sheet, figure.with_suffix(suffix))
 
 
 def main() -> int:
     """Make the figures, and return the exit status."""
-    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("figures"), metavar="FOLDER")
     parser.add_argument("--render", type=Path, default=RENDER, metavar="FILE.exr")
     parser.add_argument("--raw", type=Path, metavar="FILE", help="a camera's raw, for comparison")

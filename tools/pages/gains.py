@@ -6,20 +6,19 @@ Each dot is a picture. Its position is the gain in PSNR over the noisy picture, 
 regime. The line is the mean.
 """
 
-import argparse
 import json
 from collections.abc import Mapping
-from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from tools import ROOT
+from tools.shared.drawing import svg, text, upright
+from tools.shared.options import parser_of
 
 LABELS = {
     "awgn": "Gaussian noise, 0 to 55 levels",
     "iid": "Gaussian noise, as strong as clpipe's",
-    "intensity": "the same, by intensity",
     "real": "another camera's real pairs",
     "clpipe": "clpipe",
 }
@@ -49,60 +48,48 @@ def gains_of(scores: Mapping[str, Mapping[str, list[list[float]]]]) -> dict[str,
 def drawn(panels: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     """Return the figure as SVG: a panel for each set of pictures, a row for each regime."""
     regimes = [r for r in LABELS if any(r in gains for gains in panels.values())]
-    width = LEFT + len(panels) * (PANEL + GAP)
-    height = TOP + ROW * len(regimes) + 34
-    parts = [f'<rect width="{width}" height="{height}" rx="6" class="paper"/>']
-    for row, regime in enumerate(regimes):
-        own = ' class="own"' if regime == "clpipe" else ""
-        y = TOP + ROW * (row + 0.5)
-        parts.append(f'<g{own}><text x="14" y="{y}">{escape(LABELS[regime])}</text></g>')
+    groups = ['<g class="own">' if regime == "clpipe" else "<g>" for regime in regimes]
+    middles = [TOP + ROW * (row + 0.5) for row in range(len(regimes))]
+    bottom = TOP + ROW * len(regimes)
+    parts = [
+        f"{group}{text(14, y, LABELS[regime])}</g>"
+        for group, y, regime in zip(groups, middles, regimes, strict=True)
+    ]
     for number, (title, gains) in enumerate(panels.items()):
         left = LEFT + number * (PANEL + GAP)
-
-        def x(gain: float, left: float = left) -> float:
-            return left + PANEL * (min(max(gain, LOW), HIGH) - LOW) / (HIGH - LOW)
-
         count = len(next(iter(gains.values())))
-        middle = left + PANEL / 2
-        parts.append(f'<text class="middle" x="{middle}" y="20">{escape(title)}</text>')
+        parts.append(text(left + PANEL / 2, 20, title, "middle"))
         subtitle = f"{count} pictures, gain over the noisy one"
-        parts.append(f'<text class="pale middle" x="{middle}" y="38">{subtitle}</text>')
-        bottom = TOP + ROW * len(regimes)
+        parts.append(text(left + PANEL / 2, 38, subtitle, "pale middle"))
         for tick in range(int(LOW), int(HIGH) + 1):
-            kind = "grid" if tick else "zero"
-            at = f'x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="{TOP}" y2="{bottom}"'
-            parts.append(f'<line class="{kind}" {at}/>')
+            x = left + across(tick)
             label = f"{tick:+d}" if tick else "0 dB"
-            parts.append(
-                f'<text class="pale middle" x="{x(tick):.1f}" y="{bottom + 14}">{label}</text>'
+            parts.append(upright(x, TOP, bottom, "grid" if tick else "zero"))
+            parts.append(text(x, bottom + 14, label, "pale middle"))
+        for group, y, regime in zip(groups, middles, regimes, strict=True):
+            own = gains.get(regime, np.array([]))
+            dots = (
+                f'<circle class="dot" cx="{left + across(g):.1f}" cy="{y}" r="4"/>' for g in own
             )
-        for row, regime in enumerate(regimes):
-            if regime not in gains:
-                continue
-            y = TOP + ROW * (row + 0.5)
-            dots = "".join(
-                f'<circle class="dot" cx="{x(g):.1f}" cy="{y}" r="4"/>' for g in gains[regime]
-            )
-            mean = float(np.mean(gains[regime]))
-            at = f'x1="{x(mean):.1f}" x2="{x(mean):.1f}" y1="{y - 10}" y2="{y + 10}"'
-            own = ' class="own"' if regime == "clpipe" else ""
-            label = f'<text class="pale" x="{left + PANEL - 6:.1f}" y="{y}">{mean:+.1f}</text>'
-            parts.append(f'<g{own}>{dots}<line class="mean" {at}/>{label}</g>')
-    size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
-    title = "What a small denoiser gains on real cameras' pictures, by what it was trained on"
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img" aria-label="{escape(title)}">\n'
-        + STYLE
-        + "\n".join(parts)
-        + "\n</svg>\n"
-    )
+            parts += [group, *dots]
+            if own.size:
+                mean = float(own.mean())
+                parts.append(upright(left + across(mean), y - 10, y + 10, "mean"))
+                parts.append(text(left + PANEL - 6, y, f"{mean:+.1f}", "pale"))
+            parts.append("</g>")
+    width = LEFT + len(panels) * (PANEL + GAP)
+    label = "What a small denoiser gains on real cameras' pictures, by what it was trained on"
+    return svg(width, bottom + 34, STYLE, parts, label)
+
+
+def across(gain: float) -> float:
+    """Return the distance of a gain in dB from the left of its panel, px."""
+    return PANEL * (min(max(gain, LOW), HIGH) - LOW) / (HIGH - LOW)
 
 
 def main() -> None:
     """Read the scores, and draw the figure."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("scores", nargs="+", metavar="TITLE=scores.json")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "training.svg")
     options = parser.parse_args()

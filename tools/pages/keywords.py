@@ -17,6 +17,7 @@ from clpipe.chain.keys import CODE, KEYS
 from clpipe.chain.methods import TABLE_MODELS
 from clpipe.chain.registry import all_stages
 from tools import ROOT
+from tools.shared.options import parser_of
 
 PATH = ROOT / "clpipe" / "chain" / "keywords.pyi"
 
@@ -87,6 +88,12 @@ def text_of() -> str:
     return subprocess.run(command, input=written, stdout=PIPE, text=True, check=True).stdout
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write the file."""
+    parser_of(__doc__).parse_args()
     PATH.write_text(text_of(), "utf-8")
     print(PATH.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()

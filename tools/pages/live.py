@@ -3,13 +3,14 @@
 sh tools/run pages live --seconds 60
 """
 
-import argparse
 import threading
 import time
 
 import numpy as np
 
 import clpipe
+from tools.shared.options import parser_of, sides_of
+from tools.shared.tables import markdown
 
 LOOPS = {"exposure": {"method": "auto"}, "control": {"iso_max": 3200.0}}
 BALANCE = {"white_balance": {"method": "gray_world"}}
@@ -63,17 +64,18 @@ def measure(
 
 def main() -> None:
     """Print a table with a row for each chain."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", default="1280x720", help="the size of frames in px")
+    parser = parser_of(__doc__)
+    size = (1280, 720)
+    parser.add_argument("--size", type=sides_of, default=size, help="the size of frames in px")
     parser.add_argument("--rate", type=float, default=30, help="frames per second")
     parser.add_argument("--seconds", type=float, default=30, help="the time for each chain")
     arguments = parser.parse_args()
-    width, height = map(int, arguments.size.split("x"))
-    print("| chain | pictures per second | latency in frames, median and largest | dropped |")
-    print("|---|---|---|---|")
+    rows = []
     for name, options in CHAINS.items():
-        found = measure(options, arguments.rate, arguments.seconds, width, height)
-        print("| {} | {:.1f} | {:.2f}, {:.2f} | {} |".format(name, *found))
+        rate, *late, dropped = measure(options, arguments.rate, arguments.seconds, *arguments.size)
+        rows.append([name, f"{rate:.1f}", *(f"{each:.2f}" for each in late), dropped])
+    heads = ["chain", "pictures per second", "latency in frames, median", "largest", "dropped"]
+    print(markdown(heads, rows))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ Denoising: CPSNR of the project's own render at several ISOs, developed to 8 bit
 against the same development without noise and without denoising.
 """
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,8 +16,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from rich.console import Console
-from rich.table import Table
 
 import clpipe
 from clpipe.base.types import Array
@@ -30,6 +27,8 @@ from clpipe.reference.filter_array import NAMED
 from clpipe.stages import DEFAULT_CHAIN
 from tools import RENDER, ROOT
 from tools.compare.fidelity import psnr
+from tools.shared.options import parser_of
+from tools.shared.tables import markdown
 
 KODAK = ROOT.parent / "shared" / "data" / "kodak"
 BORDER = 10
@@ -37,16 +36,14 @@ ISOS = (400, 1600, 6400)
 Choice = Mapping[str, str | int]
 
 KODAK_NUMBERS = (1, 5, 8, 13, 19, 20, 23, 24)
+LAROCHE = {"method": "edge_directed", "classifier": "laroche_prescott"}
 # The target of each method on these pictures: figures of independent implementations (the last two:
 # colour-demosaicing 0.2.7).
 DEMOSAIC: dict[str, tuple[Choice, float | None]] = {
     "bounded": ({"method": "bounded"}, None),
     "bilinear": ({"method": "bilinear"}, 27.76),
     "edge_directed, hibbard": ({"method": "edge_directed", "classifier": "hibbard"}, 31.00),
-    "edge_directed, laroche_prescott": (
-        {"method": "edge_directed", "classifier": "laroche_prescott"},
-        32.24,
-    ),
+    "edge_directed, laroche_prescott": (LAROCHE, 32.24),
     "edge_directed, hamilton_adams": ({"method": "edge_directed"}, 35.11),
     "median, 3": ({"method": "median"}, 34.68),
     "median, 5": ({"method": "median", "size": 5}, None),
@@ -117,48 +114,43 @@ def denoising(render: Array, iso: int, method: str) -> float:
     return cpsnr(noisy.image, clean.image)
 
 
-def measure_demosaicing(folder: Path, render: Array, console: Console) -> bool:
+def measure_demosaicing(folder: Path, render: Array) -> bool:
     """Print the table of demosaicing methods; return whether each target is met."""
     photographs = kodak(folder)
     own = [clpipe.Pipeline(stages=["gamma"]).process(render, "").image]
-    table = Table("demosaic", box=None, pad_edge=False)
-    for heading in ("Kodak, 8", "target", "own render"):
-        table.add_column(heading, justify="right")
-    right = True
+    rows, right = [], True
     for name, (choice, expected) in DEMOSAIC.items():
-        row = ["", ""]
+        found, should = "", f"{expected:.2f}" if expected else ""
         if photographs:
-            found = demosaicing(photographs, choice)
-            missed = expected is not None and abs(found - expected) > TOLERANCE
-            right &= not missed
-            should = f"{expected:.2f}" if expected else ""
-            row = [f"{found:.2f}", f"{should} MISSED" if missed else should]
-        table.add_row(name, *row, f"{demosaicing(own, choice):.2f}")
+            value = demosaicing(photographs, choice)
+            found = f"{value:.2f}"
+            if expected and abs(value - expected) > TOLERANCE:
+                right, should = False, f"{should} MISSED"
+        rows.append([name, found, should, f"{demosaicing(own, choice):.2f}"])
     if not photographs:
-        console.print(f"{folder} does not contain the Kodak pictures; skipped")
-    console.print("CPSNR in dB", table, sep="\n")
+        print(f"{folder} does not contain the Kodak pictures; skipped")
+    print("CPSNR in dB\n")
+    print(markdown(["demosaic", "Kodak, 8", "target", "own render"], rows))
     return right
 
 
-def measure_denoising(render: Array, console: Console) -> None:
+def measure_denoising(render: Array) -> None:
     """Print the table of denoising methods."""
-    table = Table("denoise, own render", box=None, pad_edge=False)
-    for iso in ISOS:
-        table.add_column(f"ISO {iso}", justify="right")
-    for method in DENOISE:
-        table.add_row(method, *(f"{denoising(render, iso, method):.2f}" for iso in ISOS))
-    console.print("\nCPSNR of the finished picture in dB", table, sep="\n")
+    rows = [
+        [method, *(f"{denoising(render, iso, method):.2f}" for iso in ISOS)] for method in DENOISE
+    ]
+    print("\nCPSNR of the finished picture in dB\n")
+    print(markdown(["denoise, own render", *(f"ISO {iso}" for iso in ISOS)], rows))
 
 
 def main() -> int:
     """Measure and print the tables."""
-    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--pictures", type=Path, default=KODAK, metavar="DIR")
-    folder: Path = parser.parse_args().pictures
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    parser = parser_of(__doc__)
+    parser.add_argument("--pictures", type=Path, default=KODAK, metavar="DIR", help="[%(default)s]")
+    folder = parser.parse_args().pictures
     render = read_image(RENDER).pixels
-    right = measure_demosaicing(folder, render, console)
-    measure_denoising(render, console)
+    right = measure_demosaicing(folder, render)
+    measure_denoising(render)
     return 0 if right else 1
 
 

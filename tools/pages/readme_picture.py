@@ -4,7 +4,6 @@ Usage: tools/run pages readme_picture
 """
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 import clpipe
 from clpipe.base.types import Array
@@ -12,6 +11,8 @@ from clpipe.images.read import read_image
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 from tools import RENDER, ROOT
+from tools.shared.options import parser_of
+from tools.shared.pictures import enlarged, sheet
 
 CROPS = ((112, 226, 110, 80), (560, 300, 110, 80), (420, 470, 110, 80))  # x, y, width, height
 SCALE = 3
@@ -23,33 +24,22 @@ def plain(pixels: Array) -> Array:
     return to_8_bit(np.float32(srgb_curve(np.clip(pixels.astype(np.float64), 0, 1))))
 
 
-def sheet(columns: list[tuple[str, Image.Image]]) -> Image.Image:
-    """Draw enlarged crops, with a captioned column for each picture."""
-    gap, head = 6, 30
-    width, height = (side * SCALE for side in CROPS[0][2:])
-    size = (len(columns) * (width + gap) - gap, head + len(CROPS) * (height + gap) - gap)
-    page = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(page)
-    font = ImageFont.load_default(17)
-    for i, (caption, image) in enumerate(columns):
-        x = i * (width + gap)
-        draw.text((x + 2, 4), caption, fill="black", font=font)
-        for j, (left, top, w, h) in enumerate(CROPS):
-            crop = image.crop((left, top, left + w, top + h))
-            enlarged = crop.resize((width, height), Image.Resampling.NEAREST)
-            page.paste(enlarged, (x, head + j * (height + gap)))
-    return page
-
-
 def main() -> None:
     """Write the picture."""
+    parser_of(__doc__).parse_args()
     render = read_image(RENDER).pixels
     pictures = [("render, sRGB", plain(render))]
     for iso in ISOS:
         shot = clpipe.Pipeline(iso=iso).process(render, RENDER.name)
         pictures.append((f"clpipe, ISO {iso}", shot.image))
-    columns = [(caption, Image.fromarray(pixels)) for caption, pixels in pictures]
-    sheet(columns).save(ROOT / "docs" / "before_after.png", optimize=True)
+    rows = [
+        [
+            (caption * (number == 0), enlarged(pixels[y : y + height, x : x + width], SCALE))
+            for caption, pixels in pictures
+        ]
+        for number, (x, y, width, height) in enumerate(CROPS)
+    ]
+    sheet(rows).save(ROOT / "docs" / "before_after.png", optimize=True)
 
 
 if __name__ == "__main__":

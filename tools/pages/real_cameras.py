@@ -1,32 +1,32 @@
 """Compares real cameras' finished pictures with clpipe's: signatures, plots, crops."""
 
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
 
 import clpipe
+from clpipe.analysis.crops import choose_crops
 from clpipe.analysis.matching.columns import Figures, signature
 from clpipe.analysis.signature import BIN, MIN_SAMPLES, flat_mask, noise_of
-from clpipe.analysis.spatial import LAGS, autocorrelation, count_pairs
+from clpipe.analysis.spatial import autocorrelation, count_pairs
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.engine.device import open_device
 from clpipe.engine.runner import Runner
 from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
 from clpipe.reference.colour import luma
-from tools.pages.comparison_page import COLUMNS, cells, sheet, significant_places
+from tools.shared.pairs import find_pairs
+from tools.shared.pictures import enlarged, sheet
+from tools.shared.plots import caption, caption_spectrum, save, spectrum
+from tools.shared.tables import COLUMNS, cells
 
 ISOS = (800, 1600, 3200, 6400)
-TRUTH, PICTURE = "_mean.png", "_real.png"
-RINGS = 16  # of spatial frequency, up to half a cycle per pixel
+PLACES = ("saturated", "textured")  # of crops
+SCALE = 4  # their enlargement
 
 # Medians over cameras' own JPEGs in native size, measured by clpipe.analysis.matching.columns.
 # Noise is a picture minus the mean of many of the same scene. The pictures are not part of the
@@ -68,20 +68,10 @@ class Pair:
 
 
 def read_pairs(folder: Path) -> dict[str, list[Pair]]:
-    """Read the pairs NAME_NUMBER_real.png and NAME_NUMBER_mean.png of a folder, by NAME.
-
-    Raises:
-        FileNotFoundError: the folder has no pairs, or a picture has no mean. The message names it.
-    """
+    """Read the pairs of a folder by camera."""
     found: dict[str, list[Pair]] = defaultdict(list)
-    for path in sorted(folder.glob(f"*{PICTURE}")):
-        mean = path.with_name(path.name.removesuffix(PICTURE) + TRUTH)
-        if not mean.exists():
-            raise FileNotFoundError(f"{path} has no {mean.name} next to it")
-        name = re.sub(r"_?\d+$", "", path.name.removesuffix(PICTURE))
-        found[name].append(Pair(_read(path), _read(mean)))
-    if not found:
-        raise FileNotFoundError(f"{folder} has no pairs NAME_1{PICTURE}, NAME_1{TRUTH}")
+    for each in find_pairs(folder):
+        found[each.camera].append(Pair(_read(each.real), _read(each.mean)))
     return dict(found)
 
 
@@ -134,30 +124,17 @@ def range_row() -> list[str]:
     return ["target", *texts]
 
 
-def spectrum(pair: Pair) -> tuple[Doubles, Doubles]:
+def spectrum_of(pair: Pair) -> tuple[Doubles, Doubles]:
     """Return the power spectrum of luma noise in flat areas: frequencies in cycles per px, power.
-
-    The spectrum is the Fourier transform of the autocorrelation, up to eight pixels, with a Hann
-    window (Blackman and Tukey 1958). Each value is the mean over a ring of equal frequency.
-    Independent noise has a power of 1.
 
     >>> grey = np.full((128, 128, 3), 128.0)
     >>> noisy = grey + np.random.default_rng(0).normal(0, 5, grey.shape)
-    >>> bool(np.allclose(spectrum(Pair(noisy, grey))[1][2:], 1, atol=0.3))
+    >>> bool(np.allclose(spectrum_of(Pair(noisy, grey))[1], 1, atol=0.3))
     True
     """
     mask = flat_mask(pair.clean)
     noise = np.where(mask, luma(noise_of(pair.noisy, pair.clean)), 0)
-    lags = np.nan_to_num(autocorrelation(noise[None].astype(np.float32), count_pairs(mask)))
-    window = np.hanning(2 * LAGS + 3)[1:-1]
-    lag = np.arange(-LAGS, LAGS + 1)
-    frequencies = np.linspace(-0.5, 0.5, 4 * RINGS + 1)
-    waves = np.exp(2j * np.pi * np.outer(frequencies, lag))
-    power = (waves @ (lags * np.outer(window, window)) @ waves.T).real
-    ring = (np.hypot(frequencies[:, None], frequencies) * 2 * RINGS).astype(int)
-    inner = ring < RINGS
-    total, count = (np.bincount(ring[inner], weights) for weights in (power[inner], None))
-    return (np.arange(RINGS) + 0.5) / (2 * RINGS), total / count
+    return spectrum(autocorrelation(noise[None].astype(np.float32), count_pairs(mask)))
 
 
 def sigma_by_intensity(pairs: Iterable[Pair]) -> tuple[Doubles, Doubles]:
@@ -190,35 +167,24 @@ def draw(
     spectra, intensity = figure.subplots(1, 2)
     for group, style in ((real, "--"), (ours, "-")):
         for name, pairs in group.items():
-            each = [spectrum(pair) for pair in pairs]
+            each = [spectrum_of(pair) for pair in pairs]
             power = np.median([power for _, power in each], axis=0)
             (line,) = spectra.plot(each[0][0], power, style, label=name)
             levels, sigmas = sigma_by_intensity(pairs)
             intensity.plot(levels, sigmas, style, color=line.get_color(), label=name)
-    _label(spectra, "Power spectrum of luma noise", "cycles per pixel", "power; independent: 1")
-    spectra.set_yscale("log")
-    spectra.yaxis.set_minor_formatter("")
-    spectra.set_yticks(ticks := (0.1, 0.2, 0.5, 1, 2, 5, 10), [f"{tick:g}" for tick in ticks])
-    _label(intensity, "Noise by intensity", "luma without noise, levels", "sigma of luma, levels")
+    caption_spectrum(spectra, "Power spectrum of luma noise")
+    titles = "Noise by intensity", "luma without noise, levels", "sigma of luma, levels"
+    caption(intensity, *titles)
     intensity.set_ylim(bottom=0)
     figure.legend(*spectra.get_legend_handles_labels(), loc="outside right center")
-    FigureCanvasSVG(figure)
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "clpipe"}):  # small, and reproducible
-        figure.savefig(path, metadata={"Date": None})
-
-
-def _label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
-    axes.set_title(title)
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    axes.grid(alpha=0.3)
+    save(figure, path)
 
 
 def crops(groups: Mapping[str, Pair]) -> Image.Image:
     """Draw two crops of each picture at 400 %, with a column for each picture."""
-    columns = {
-        name: {place.name: place.of(pair.noisy) for place in significant_places(pair.clean)}
-        for name, pair in groups.items()
-    }
-    places = next(iter(columns.values()))
-    return sheet([*columns], {what: [of[what] for of in columns.values()] for what in places})
+    rows: dict[str, list[tuple[str, Array]]] = {place: [] for place in PLACES}
+    for name, pair in groups.items():
+        for place in choose_crops(PLACES, pair.clean.astype(np.float32) / np.float32(255)):
+            heading = name if place.name == PLACES[0] else ""
+            rows[place.name].append((heading, enlarged(place.of(pair.noisy), SCALE)))
+    return sheet(rows.values(), PLACES)

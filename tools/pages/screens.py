@@ -25,6 +25,7 @@ from clpipe.inputs.find import Job
 from clpipe.reports.page import html
 from clpipe.reports.run import read_run
 from tools import RENDER, ROOT
+from tools.shared.options import parser_of
 
 SIZE = {"width": 1366, "height": 768}
 
@@ -73,6 +74,7 @@ def explorer(page: Any) -> None:
 
 def main() -> None:
     """Write the pictures."""
+    parser_of(__doc__).parse_args()
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError:

@@ -4,15 +4,12 @@ A chart of grey patches is developed at three ISOs. For each patch, the skew of 
 over the patch's luma. Each panel has one change.
 """
 
-import argparse
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 import clpipe
@@ -21,8 +18,8 @@ from clpipe.base.types import Doubles, Floats
 from clpipe.reference.colour import luma
 from clpipe.reference.transfer import inverse_srgb_curve, srgb_curve
 from clpipe.stages.tone_curve import Standard
-from tools import ROOT
-from tools.pages.comparison_page import markdown
+from tools.shared.plots import save
+from tools.shared.tables import markdown
 
 ISOS = (1600, 3200, 6400)
 LEVELS = 24  # patches
@@ -121,36 +118,14 @@ def draw(path: Path) -> dict[str, list[float]]:
     panels[0].legend(fontsize=8)
     figure.supxlabel("luma without noise, levels")
     figure.supylabel("skew of luma noise")
-    FigureCanvasSVG(figure)
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "clpipe"}):  # small, and reproducible
-        figure.savefig(path, metadata={"Date": None})
+    save(figure, path)
     return means
 
 
-def section(options: argparse.Namespace) -> bool:
-    """Print the section of the page; return whether the default chain meets the target."""
-    means = draw(ROOT / "docs" / "skew.svg")
+def section(path: Path) -> bool:
+    """Draw the panels, print the table; return whether the default chain meets the target."""
+    means = draw(path)
     heads = [f"{low} to {high}, ISO {iso}" for iso in ISOS for low, high in RANGES]
     rows = [[name, *(f"{value:+.2f}" for value in values)] for name, values in means.items()]
-    print(TEXT)
     print(markdown(["mean skew at luma", *heads], rows))
     return min(means["default"]) >= REAL[0] and max(means["default"]) <= REAL[1]
-
-
-TEXT = """
-## What skews noise
-
-In midtones, the luma noise of real cameras is nearly symmetric: its skew is between -0.20 and +0.08
-at luma 80 to 220 (grey in the plots). Each panel changes one thing in the default chain. The scene
-is a chart of greys.
-
-- A tone curve with a kink at grey skews noise most: its skew jumps there from +0.2 to -0.25. The
-  default's curve has one piece, whose slope changes slowly.
-- A curve on the largest of the three colours differs little on greys. On colours, that maximum
-  selects noise.
-- Noise that is stronger when it reaches the curve is skewed more. This explains the effects of
-  sharpening, of a demosaicing method that amplifies noise, and of no denoising.
-- Without an S-curve, noise in shadows is skewed, because the display's gamma is steep there.
-
-![Skew of luma noise over luma, for eight changes](skew.svg)
-"""

@@ -1,28 +1,26 @@
-"""Simulate known noise, measure it, and print the page docs/validation.md.
+"""Simulate known noise, measure it, and print the tables of docs/validation.md.
 
-    tools/run pages validate --real FOLDER > docs/validation.md
+    tools/run pages validate --real FOLDER
     tools/run pages validate --only cameras [RENDER ...]
 
-It has these sections. In a closed loop, frames with known parameters are simulated for every camera,
-ISO and pattern, and calibrated without knowing them. Poisson numbers are compared with their exact
-distribution. Finished pictures are compared with figures measured on those of real cameras. The
-exit status is 1 if a figure misses its target.
+The closed loop simulates frames with known parameters for every camera, ISO and pattern, and
+calibrates them without knowing these. Poisson numbers are compared with their exact distribution,
+and finished pictures with figures of real cameras. The exit status is 1 if a figure misses its
+target.
 
 FOLDER contains pictures of real cameras, which are not part of the repository, as pairs
-NAME_1_real.png and NAME_1_mean.png, the mean of many pictures of the same scene. They are measured,
-their curves are drawn into docs/real_cameras.svg, and their crops go to the output directory.
-docs/real_cameras_crops.png shows those of clpipe.
+NAME_1_real.png and NAME_1_mean.png, the mean of many pictures of the same scene. The tool measures
+them, draws docs/real_cameras.svg, and writes their crops to the output directory. It always draws
+docs/real_cameras_crops.png and docs/skew.svg.
 """
 
 import argparse
-import io
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy.stats import chi2, poisson
 
 import clpipe
@@ -32,16 +30,18 @@ from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture
 from clpipe.analysis.spatial import LAGS
 from clpipe.base.errors import ClpipeError
-from clpipe.base.types import Floats
+from clpipe.base.types import Array, Floats
 from clpipe.camera.profile import load_camera
 from clpipe.chain.settings import Settings
+from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
 from clpipe.images.read import read_image
 from clpipe.reference.cfa import PATTERNS, Pattern
 from clpipe.reference.poisson import poisson_of
 from tools import RENDER, ROOT
 from tools.compare import look
 from tools.pages import real_cameras, skew
-from tools.pages.comparison_page import COLUMNS, markdown
+from tools.shared.options import parser_of, sides_of
+from tools.shared.tables import COLUMNS, markdown
 
 DOCS = ROOT / "docs"
 CAMERAS = ("sony-a7r2", "sony-a7s2", "canon-5d2")
@@ -67,6 +67,8 @@ REAL = {
     "R-B": 0.56,
 }
 ALLOWED = 0.1
+LAGS_SHOWN = {"1 right": (0, 1), "1 below": (1, 0), "diagonal": (1, 1), "2 right": (0, 2)}
+LEVELS = ("RGGB", 0.0, 1.0)  # the pattern, which display pictures ignore, and the range
 
 
 @dataclass(frozen=True)
@@ -167,89 +169,65 @@ def poisson_p(mean: float, count: int) -> float:
     return float(chi2.sf(np.sum((o - e) ** 2 / e), len(e) - 1))
 
 
-def as_jpeg(pixels: np.ndarray) -> Floats:
-    """Return a picture after encoding as clpipe's JPEG and decoding, 0..1."""
-    with io.BytesIO() as buffer:
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=97, subsampling="4:2:2")
-        return np.asarray(Image.open(buffer), np.float32) / 255
-
-
 def finished(config: str, iso: float) -> dict[str, float]:
     """Return the figures of REAL for the render's JPEG with a configuration."""
     render = read_image(RENDER).pixels
     whole = clpipe.Pipeline(config, iso=iso)
+
+    def decoded(pixels: Array) -> Floats:
+        return jpeg_round_trip(pixels, JpegEncoding(97, "4:2:2")).astype(np.float32) / 255
+
     clean = clpipe.Pipeline(config, iso=iso, skip=[*NOISE])
     noisy, truth = (
-        Picture(Path("render"), "display", as_jpeg(p.process(render, "k").image), "RGGB", 0.0, 1.0)
-        for p in (whole, clean)
+        Picture(Path("render"), "display", decoded(pipeline.process(render, "k").image), *LEVELS)
+        for pipeline in (whole, clean)
     )
     report = measure([noisy], truth)
     of = {one.name: one for one in report.channels}
 
-    def lag(names: tuple[str, ...], down: int, right: int) -> float:
-        return float(np.mean([of[n].autocorrelation[LAGS + down, LAGS + right] for n in names]))
-
-    luma, chroma = ("Y",), ("Cb", "Cr")
-    return {
-        "luma, 1 right": lag(luma, 0, 1),
-        "luma, 1 below": lag(luma, 1, 0),
-        "luma, diagonal": lag(luma, 1, 1),
-        "chroma, 1 right": lag(chroma, 0, 1),
-        "chroma, 1 below": lag(chroma, 1, 0),
-        "chroma, diagonal": lag(chroma, 1, 1),
-        "chroma, 2 right": lag(chroma, 0, 2),
-        "luma left after 2x2": of["Y"].energy_left_2x2,
-        "chroma left after 2x2": float(np.mean([of[n].energy_left_2x2 for n in chroma])),
-        "R-G": report.correlation["R-G"],
-        "G-B": report.correlation["G-B"],
-        "R-B": report.correlation["R-B"],
-    }
+    found = {pair: report.correlation[pair] for pair in ("R-G", "G-B", "R-B")}
+    for kind, names in {"luma": ("Y",), "chroma": ("Cb", "Cr")}.items():
+        left = [of[name].energy_left_2x2 for name in names]
+        found[f"{kind} left after 2x2"] = float(np.mean(left))
+        for where, (down, right) in LAGS_SHOWN.items():
+            lags = [of[name].autocorrelation[LAGS + down, LAGS + right] for name in names]
+            found[f"{kind}, {where}"] = float(np.mean(lags))
+    return {what: found[what] for what in REAL}
 
 
 def closed_loop(options: argparse.Namespace) -> bool:
-    """Print the section of the closed loop; return whether all targets are met."""
-    width, height = map(int, options.size.split("x"))
-    missed = []
-    print(LOOP.format(frames=FRAMES, width=width, height=height))
-    print("| camera | ISO | a, % | in s.e. | b, % | in s.e. | rows, % | columns, % | hot wrong |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    """Print the table of the closed loop; return whether all targets are met."""
+    width, height = options.size
+    rows, missed = [], []
     for name, iso, found in loops(height, width):
         if not all(loop.good for loop in found):
             missed.append(f"{name} at ISO {iso}")
         worst = [max((getattr(loop, f.name) for loop in found), key=abs) for f in fields(Loop)]
         a, a_errors, b, b_errors, row, column, hot = worst
-        print(
-            f"| {name} | {iso} | {a:+.2%} | {a_errors:+.1f} | {b:+.2%} | {b_errors:+.1f} "
-            f"| {row:+.2%} | {column:+.2%} | {hot} |".replace("%", ""),
-            flush=True,
-        )
+        cells = [f"{100 * a:+.2f}", f"{a_errors:+.1f}", f"{100 * b:+.2f}", f"{b_errors:+.1f}"]
+        rows.append([name, iso, *cells, f"{100 * row:+.2f}", f"{100 * column:+.2f}", hot])
+    heads = ["a, %", "in s.e.", "b, %", "in s.e.", "rows, %", "columns, %", "hot wrong"]
+    print(markdown(["camera", "ISO", *heads], rows))
     if missed:
         print(f"\nRows that miss a target: {', '.join(missed)}.")
     return not missed
 
 
 def photo_electrons(options: argparse.Namespace) -> bool:
-    """Print the section of Poisson numbers; return whether the target is met."""
-    print(POISSON.format(draws=options.draws))
-    print("| mean, e- | " + " | ".join(f"{mean:g}" for mean in MEANS) + " |")
-    print("|---" * (len(MEANS) + 1) + "|")
+    """Print the table of Poisson numbers; return whether the target is met."""
     values = [poisson_p(mean, options.draws) for mean in MEANS]
-    print("| p | " + " | ".join(f"{p:.3f}" for p in values) + " |", flush=True)
+    heads = ["mean, e-", *(f"{mean:g}" for mean in MEANS)]
+    print(markdown(heads, [["p", *(f"{p:.3f}" for p in values)]]))
     return min(values) > 0.001
 
 
 def canon(options: argparse.Namespace) -> bool:
-    """Print the section of canon-5d2-jpeg; return whether all targets are met."""
-    good = True
-    print(CANON)
-    print("| | real camera | canon-5d2-jpeg, ISO 3200 | ISO 6400 | default chain, sony-a7r2 |")
-    print("|---|---|---|---|---|")
+    """Print the table of canon-5d2-jpeg; return whether all targets are met."""
     low, high = finished("canon-5d2-jpeg", 3200), finished("canon-5d2-jpeg", 6400)
-    default = finished("default", 3200)
-    for what, real in REAL.items():
-        good &= abs(low[what] - real) < ALLOWED
-        print(f"| {what} | {real:.2f} | {low[what]:.2f} | {high[what]:.2f} | {default[what]:.2f} |")
-    return good
+    every = (REAL, low, high, finished("default", 3200))
+    heads = ["", "real camera", "canon-5d2-jpeg, ISO 3200", "ISO 6400", "default chain, sony-a7r2"]
+    print(markdown(heads, [[what, *(f"{of[what]:.2f}" for of in every)] for what in REAL]))
+    return all(abs(low[what] - real) < ALLOWED for what, real in REAL.items())
 
 
 def cameras(options: argparse.Namespace) -> bool:
@@ -271,10 +249,7 @@ def cameras(options: argparse.Namespace) -> bool:
         missed = real_cameras.outside(record)
         good &= not missed
         rows.append(real_cameras.row(name, record, missed))
-    names = ", ".join(path.stem for path in (RENDER, *options.renders))
-    print(CAMERA_SECTION.format(renders=names))
     print(markdown(["", *(head for head, *_ in COLUMNS)], rows))
-    print(PICTURES, flush=True)
     first_ours, first_real = ({k: pairs[0] for k, pairs in group.items()} for group in (ours, real))
     real_cameras.crops(first_ours).save(DOCS / "real_cameras_crops.png", optimize=True)
     if real:
@@ -286,137 +261,48 @@ def cameras(options: argparse.Namespace) -> bool:
     return good
 
 
-EDGES = """## Edges, chroma, lens and tone
-
-`tools/run compare look` measures the default chain on slanted edges with noise, on a dead leaves image and on the project's render. The last
-column has 10, 50 and 90 % of real cameras. They are 119 to 130 full-size JPEGs from public test collections (metadata-extractor-images,
-exif-samples, Sceaux castle and others), whose sharpest quarter of edges is measured.
-
-At no contrast do edges become sharper with the ISO. The ground truth is as sharp as the picture at contrasts of 4:1 and 10:1. Where noise is
-stronger than a detail, denoising blurs the detail, and `clean` remains sharper. The faults of a lens are those of `lens=typical`, in
-pictures of 2 megapixels.
-"""
-
-
 def edges(options: argparse.Namespace) -> bool:
-    """Print the section of edges; it has ranges, but no targets."""
-    print(EDGES)
+    """Print the tables of edges, which have ranges, but no targets."""
     look.print_tables(Settings(), [str(RENDER), *map(str, options.renders)])
-    print()
     return True
 
 
-SECTIONS: dict[str, Callable[[argparse.Namespace], bool]] = {
-    "loop": closed_loop,
-    "poisson": photo_electrons,
-    "canon": canon,
-    "cameras": cameras,
-    "skew": skew.section,
-    "edges": edges,
+# The sections by their words for --only, with their headings on the page.
+SECTIONS: dict[str, tuple[str, Callable[[argparse.Namespace], bool]]] = {
+    "loop": ("Calibration of known noise", closed_loop),
+    "poisson": ("Photo-electrons", photo_electrons),
+    "canon": ("A real camera's finished pictures", canon),
+    "cameras": ("Comparison with real cameras", cameras),
+    "skew": ("What skews noise", lambda _: skew.section(DOCS / "skew.svg")),
+    "edges": ("Edges, chroma, lens and tone", edges),
 }
 
 
 def main() -> int:
-    """Print the page, or some of its sections."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "renders",
-        nargs="*",
-        type=Path,
-        metavar="RENDER",
-        help="for cameras, in addition to the still life",
-    )
-    parser.add_argument(
-        "--only", action="append", choices=SECTIONS, help="print only this section; may be repeated"
-    )
-    parser.add_argument("--size", default="2400x1600", help="of the frames, WxH [%(default)s]")
-    parser.add_argument("--draws", type=int, default=10_000_000, help="Poisson numbers per mean")
-    parser.add_argument("--real", type=Path, metavar="FOLDER", help="pairs of real cameras")
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=ROOT / "build/validate",
-        metavar="OUT",
-        help="for crops of the pairs",
-    )
+    """Print the tables of the page, or of some of its sections."""
+    parser = parser_of(__doc__)
+    add = parser.add_argument
+    further = "for cameras, in addition to the still life"
+    add("renders", nargs="*", type=Path, metavar="RENDER", help=further)
+    add("--only", action="append", choices=SECTIONS, help="only this section; may be repeated")
+    add("--size", type=sides_of, default=(2400, 1600), help="of the frames [2400x1600]")
+    add("--draws", type=int, default=10_000_000, help="Poisson numbers per mean [%(default)s]")
+    add("--real", type=Path, metavar="FOLDER", help="pairs of real cameras")
+    folder = ROOT / "build/validate"
+    add("-o", "--output", type=Path, default=folder, metavar="OUT", help="for crops of the pairs")
     options = parser.parse_args()
-    if not options.only:
-        print(PAGE)
+    good = []
     try:
-        good = [SECTIONS[name](options) for name in options.only or SECTIONS]
-    except (ClpipeError, FileNotFoundError) as error:
+        for name in options.only or SECTIONS:
+            heading, section = SECTIONS[name]
+            print(f"## {heading}\n", flush=True)
+            good.append(section(options))
+            print(flush=True)
+    except ClpipeError as error:
         print(f"validate: {error}", file=sys.stderr)
         return 1
     return 0 if all(good) else 1
 
-
-PAGE = """# Validation
-
-This page compares simulated noise with its model and with real cameras. `tools/run pages validate` measures the figures and makes the page. For
-other programs, see [Quality](quality.md). To measure your own images, see [Measuring and calibrating](measuring.md).
-"""
-
-LOOP = """## Calibration of known noise
-
-The tool simulates {frames} frames of a scene and {frames} dark frames, {width}x{height}, with a camera's noise at an ISO. The noise
-consists of Poisson photo-electrons, read, row and column noise, PRNU, DSNU, hot pixels and rounding to whole DN. `clpipe calibrate`
-receives only the levels and the pattern, and estimates everything else.
-
-Each row lists the worst of the four Bayer patterns. Errors are relative, in %. Errors of a and b are also listed in standard errors; by chance, one
-row in three has an error above 2. The last column counts hot pixels that were missed or invented. The targets
-are 1 % and 3 standard errors for a and b, 3 % for rows and columns, and no wrong hot pixel.
-"""
-
-POISSON = """
-## Photo-electrons
-
-A chi-square test compares {draws} Poisson numbers with the exact distribution, in cells of 10 and more. The target is p above 0.001. The test suite
-also compares the tails, to 1e-6, with the exact probabilities.
-"""
-
-CANON = """
-## A real camera's finished pictures
-
-This table compares the correlation of noise in small JPEGs of a Canon EOS 5D Mark II with `clpipe run -c canon-5d2-jpeg` on the project's render.
-The JPEGs have 2784x1856 pixels, half the size of 5616x3744. There are 11 pairs at ISO 3200 and 6400. Noise is one frame minus the mean of many, in flat
-areas.
-
-The camera's processing is unknown. The configuration has its colour matrix, its sensor's noise and the half size. Denoising and sharpening were fitted
-to these figures on this render. The target is a difference below 0.1 at ISO 3200. Independent noise has 0 everywhere, and
-0.25 after averaging 2x2.
-"""
-
-CAMERA_SECTION = """
-## Comparison with real cameras
-
-This section compares cameras' JPEGs at native size with pictures of the default chain ({renders}). Noise is one picture minus the mean of many
-of the same scene. For the default chain, it is the picture minus its development without noise. Drifting light is removed (a Gaussian of 12 px).
-Only areas that are flat in the mean are measured: below the 60th percentile of the gradient, with luma of 30 to 225. Figures are medians over
-pictures.
-
-| column | meaning |
-|---|---|
-| rms | of 8-bit luma; without a target, because it depends on sensor, exposure and scene |
-| kurtosis, beyond 4 sigma | of luma over the sigma of its intensity (Gaussian: 3.0 and 0.6) |
-| right, below, diagonal, 2 right | autocorrelation of luma |
-| half | share of luma's variance that averaging 2x2 leaves (independent noise: 0.25) |
-| chroma right | autocorrelation of Cb and Cr |
-| R-G | correlation of red and green |
-
-The first rows are measured with `clpipe.analysis.matching.columns` on the pictures of Nam, Hwang, Matsushita and Kim. Their paper is "A holistic
-approach to cross-channel image noise modeling and its application to image denoising" (CVPR 2016). **Bold** figures miss the target.
-"""
-
-PICTURES = """
-Luma noise by spatial frequency and by intensity; cameras are dashed:
-
-![Power spectra of luma noise, and its sigma by intensity](real_cameras.svg)
-
-The default chain, enlarged to 400 %:
-
-![Crops of the still life at four ISOs](real_cameras_crops.png)
-"""
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,7 +1,7 @@
 """Reconstruct a scene from six views, with the noise of a camera and with simpler noise, by ISO.
 
     tools/run reconstruction experiment -o OUT [--iso ISO ...] [--seeds N] [-c CONFIG] [--pmvs PATH]
-        [--colmap PATH] [--data FOLDER] [--render BLENDER]
+        [--data FOLDER] [--render BLENDER]
 
 It needs pip install '.[calibrate,compare]' in the checkout. It repeats the experiment of section
 3.2 of the paper on a scene with known depth. The paper is by Bielova, Haensch, Ley and Hellwich
@@ -15,31 +15,28 @@ clpipe develops each view in these ways (pictures.py):
 - with independent noise that has the camera's variance after averaging 2x2
 
 OpenCV's semi-global matching finds the depth of neighbouring views at full and half resolution
-(stereo.py). With --pmvs, PMVS2 also finds points in all views. With --colmap, COLMAP's dense stereo
-finds points; it needs CUDA (multiview.py).
+(stereo.py). With --pmvs, PMVS2 also finds points in all views (multiview.py).
 
 The tool prints tables, and writes them with the figures and pictures to OUT, as Markdown and CSV.
 """
 
-import argparse
 import csv
 import importlib.util
-import shutil
+import itertools
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.processors import available_processors
-from tools.pages.comparison_page import markdown
-from tools.reconstruction.multiview import THRESHOLDS, ProgramError, run_colmap, run_pmvs, true_of
+from tools.reconstruction.multiview import THRESHOLDS, ProgramError, run_pmvs, true_of
 from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS, Pictures, energy_left
 from tools.reconstruction.report import (
     as_markdown,
@@ -48,11 +45,13 @@ from tools.reconstruction.report import (
     depth_picture,
     draw,
     points_of,
-    sheet,
     table_of,
 )
 from tools.reconstruction.stereo import Pair, halved, pairs, score
 from tools.reconstruction.views import TEXTURES, View, read_views, render_views
+from tools.shared.options import count_of, parser_of
+from tools.shared.pictures import sheet
+from tools.shared.tables import markdown
 
 DATA = Path(__file__).with_name("data")
 NEEDED = ("cv2", "matplotlib")
@@ -82,9 +81,8 @@ class StereoRow:
 
 @dataclass(frozen=True)
 class PointsRow:
-    """The number of points that a program found for a kind of picture, and how many are true."""
+    """The number of points that PMVS2 found for a kind of picture, and how many are true."""
 
-    program: str
     resolution: str
     threshold: float
     kind: str
@@ -129,70 +127,50 @@ def compare_stereo(views: Sequence[View], pictures: Pictures) -> Iterator[Stereo
             yield from each
 
 
-def compare_points(
-    programs: dict[tuple[str, str, float], partial], views: Sequence[View], pictures: Pictures
-) -> Iterator[PointsRow]:
-    """Find points for all kinds of picture, with each program, resolution and threshold."""
-
-    def rows(work: tuple[tuple[str, str, float], Job]) -> list[PointsRow]:
-        (name, resolution, threshold), job = work
-        kind, iso, seed = job
-        place = f"{name}-{resolution}-{threshold:g}-{kind}-iso{iso}-seed{seed}"
-        folder = pictures.out / "points" / place.replace(", ", "-").replace(" ", "-")
-        points, _ = programs[work[0]](folder, views, pictures.read(*job))
-        is_true, texture = true_of(points, views)
-        counts = []
-        for label, number in {ALL: 0, **TEXTURES}.items():
-            these = (texture == number) | (number == 0)
-            count, true = int(these.sum()), int((these & is_true).sum())
-            counts.append(PointsRow(name, resolution, threshold, *job, label, count, true))
-        print(f"{place}: {len(points)} points", file=sys.stderr, flush=True)
-        return counts
-
-    work = [(program, job) for program in programs for job in pictures.all()]
-    with ThreadPoolExecutor(available_processors()) as threads:
-        for each in threads.map(rows, work):
-            yield from each
-
-
-def points_until_stopped(
-    programs: dict[tuple[str, str, float], partial],
-    views: Sequence[View],
-    pictures: Pictures,
+def points_of_picture(
+    program: Path, views: Sequence[View], pictures: Pictures, setting: tuple[str, float], job: Job
 ) -> list[PointsRow]:
-    """Collect the rows of :func:`compare_points`; after Ctrl-C, only those of finished programs.
-
-    Raises:
-        KeyboardInterrupt: no program is finished.
-    """
-    rows: list[PointsRow] = []
-    try:
-        for row in compare_points(programs, views, pictures):
-            rows.append(row)
-    except KeyboardInterrupt:
-        counts = Counter((row.program, row.resolution, row.threshold) for row in rows)
-        most = len(pictures.all()) * (len(TEXTURES) + 1)
-        whole = {run for run, count in counts.items() if count == most}
-        rows = [row for row in rows if (row.program, row.resolution, row.threshold) in whole]
-        if not rows:
-            raise
-        print(f"stopped; the report covers {len(whole)} finished programs", file=sys.stderr)
-    return rows
-
-
-def programs_of(pmvs: Path | None, colmap: Path | None) -> dict[tuple[str, str, float], partial]:
-    """Return the functions that find points, by name, resolution and threshold.
+    """Find points with PMVS2 at a resolution and a threshold in the pictures of a job.
 
     PMVS2 uses one thread, because its points are then the same in each run.
     """
-    found = {}
-    for resolution, half in reversed(RESOLUTIONS.items()):  # the faster ones first
-        if pmvs:
-            for threshold in THRESHOLDS:
-                options = {"level": int(half), "threshold": threshold, "threads": 1}
-                found["PMVS2", resolution, threshold] = partial(run_pmvs, pmvs, **options)
-        if colmap:
-            found["COLMAP", resolution, np.nan] = partial(run_colmap, colmap, half=half)
+    resolution, threshold = setting
+    kind, iso, seed = job
+    place = f"PMVS2-{resolution}-{threshold:g}-{kind}-iso{iso}-seed{seed}"
+    folder = pictures.out / "points" / place.replace(", ", "-").replace(" ", "-")
+    options = {"level": int(RESOLUTIONS[resolution]), "threshold": threshold, "threads": 1}
+    points, _ = run_pmvs(program, folder, views, pictures.read(*job), **options)
+    is_true, texture = true_of(points, views)
+    rows = []
+    for label, number in {ALL: 0, **TEXTURES}.items():
+        these = (texture == number) | (number == 0)
+        counts = int(these.sum()), int((these & is_true).sum())
+        rows.append(PointsRow(resolution, threshold, *job, label, *counts))
+    print(f"{place}: {len(points)} points", file=sys.stderr, flush=True)
+    return rows
+
+
+def compare_points(program: Path, views: Sequence[View], pictures: Pictures) -> list[PointsRow]:
+    """Find points in all pictures at each resolution and threshold, half resolution first.
+
+    After Ctrl-C, it returns the rows of finished settings.
+
+    Raises:
+        KeyboardInterrupt: no setting is finished.
+    """
+    found: list[PointsRow] = []
+    with ThreadPoolExecutor(available_processors()) as threads:
+        for setting in itertools.product(reversed(RESOLUTIONS), THRESHOLDS):
+            rows = partial(points_of_picture, program, views, pictures, setting)
+            try:
+                made = list(threads.map(rows, pictures.all()))
+            except KeyboardInterrupt:
+                threads.shutdown(cancel_futures=True)
+                if not found:
+                    raise
+                print("stopped; the report covers what is finished", file=sys.stderr)
+                break
+            found += itertools.chain.from_iterable(made)
     return found
 
 
@@ -221,13 +199,9 @@ def stereo_pictures(
         images = pictures.read(kind, own, seed)
         small = halved(images[a])
         full, half = (pair.find(images[a], images[b]) for pair in (at_full, at_half))
-        maps.append(
-            [
-                (title, small),
-                ("depth", depth_picture(full, *span)[::2, ::2]),
-                ("depth at half resolution", depth_picture(half, *span)),
-            ]
-        )
+        at_full_size = "depth", depth_picture(full, *span)[::2, ::2]
+        at_half_size = "depth at half resolution", depth_picture(half, *span)
+        maps.append([(title, small), at_full_size, at_half_size])
         cloud = cloud_picture(*points_of(view, half, small), view)
         clouds.append((title, cloud))
     sheet(maps).save(pictures.out / "depth.png")
@@ -251,9 +225,7 @@ def report_stereo(out: Path, rows: Sequence[StereoRow], text: list[str]) -> None
         weak[f"{resolution} resolution, weak texture"] = tables["weak"]
         for value, label in (("median_mm", "Median"), ("rms_mm", "RMS")):
             errors = {
-                name: table_of(
-                    rows, lambda r, v=value: getattr(r, v), resolution=resolution, texture=name
-                )
+                name: table_of(rows, attrgetter(value), resolution=resolution, texture=name)
                 for name in (*TEXTURES, ALL)
             }
             text.append(as_markdown(f"{label} error, {resolution} resolution, mm", errors, ".1f"))
@@ -265,24 +237,16 @@ def report_points(out: Path, rows: Sequence[PointsRow], text: list[str]) -> None
     """Write the CSV and the figure of points, and append tables to the text."""
     write_csv(out / "points.csv", rows)
     panels, counts = [], {}
-    for program, resolution, threshold in dict.fromkeys(
-        (row.program, row.resolution, row.threshold) for row in rows
-    ):
-        name = f"{program}, {resolution} resolution"
-        name += "" if np.isnan(threshold) else f", threshold {threshold:g}"
-        chosen = [
-            row
-            for row in rows
-            if (row.program, row.resolution) == (program, resolution)
-            and row.threshold in {threshold}
-        ]
+    for resolution, threshold in dict.fromkeys((row.resolution, row.threshold) for row in rows):
+        name = f"PMVS2, {resolution} resolution, threshold {threshold:g}"
+        own = {"resolution": resolution, "threshold": threshold}
         tables = {
-            texture: table_of(chosen, lambda r: r.points, texture=texture)
+            texture: table_of(rows, lambda r: r.points, texture=texture, **own)
             for texture in (*TEXTURES, ALL)
         }
         text.append(as_markdown(f"Points: {name}", tables, ".0f"))
-        true = {ALL: table_of(chosen, lambda r: 100 * r.true / max(r.points, 1), texture=ALL)}
-        text.append(as_markdown(f"On a surface: {name}, %", true, ".1f"))
+        share = table_of(rows, lambda r: 100 * r.true / max(r.points, 1), texture=ALL, **own)
+        text.append(as_markdown(f"On a surface: {name}, %", {ALL: share}, ".1f"))
         counts[name] = tables[ALL]
         panels.append((name, "points / 1000", tables[ALL]))
     text.append(costs_of(counts))
@@ -300,41 +264,21 @@ def energies(pictures: Pictures) -> str:
     return f"### Variance that survives averaging 2x2\n\n{markdown(heads, rows)}\n"
 
 
-def positive_int(text: str) -> int:
-    """Parse a whole number above 0."""
-    if not text.isdecimal() or not int(text):
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected a whole number above 0")
-    return int(text)
-
-
-def program(text: str) -> Path:
-    """Find the path of a program."""
-    path = shutil.which(text)
-    if path is None:
-        raise argparse.ArgumentTypeError(f"found {text!r}; expected a program")
-    return Path(path).absolute()
-
-
 def main() -> int:
     """Run the experiment."""
-    parser = argparse.ArgumentParser(
-        description=(__doc__ or "").split("\n\n", maxsplit=1)[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    parser = parser_of(__doc__)
     add = parser.add_argument
     add("-o", "--output", type=Path, required=True, metavar="OUT", help="output directory")
-    add("--iso", type=positive_int, nargs="+", default=ISOS, help="the ISOs")
-    add("--seeds", type=positive_int, default=SEEDS, help="number of seeds of the noise")
-    add("-c", "--config", default="paper", help="configuration of clpipe")
-    add("--pmvs", type=program, metavar="PATH", help="the program pmvs2")
-    add("--colmap", type=program, metavar="PATH", help="the program colmap, built with CUDA")
-    add("--data", type=Path, default=DATA, help="folder of the views")
-    add(
-        "--render",
-        metavar="BLENDER",
-        help="render the views into --data, with Blender or a Python with bpy",
-    )
+    add("--iso", type=count_of, nargs="+", default=ISOS, help="the ISOs [%(default)s]")
+    add("--seeds", type=count_of, default=SEEDS, help="number of seeds of the noise [%(default)s]")
+    add("-c", "--config", default="paper", help="configuration of clpipe [%(default)s]")
+    add("--pmvs", type=Path, metavar="PATH", help="the program pmvs2")
+    add("--data", type=Path, default=DATA, help="folder of the views [%(default)s]")
+    text = "render the views into --data, with Blender or a Python with bpy"
+    add("--render", metavar="BLENDER", help=text)
     options = parser.parse_args()
+    if options.pmvs and not options.pmvs.is_file():
+        parser.error(f"--pmvs: {options.pmvs} does not exist; give the path of the program")
     for module in NEEDED:
         if importlib.util.find_spec(module) is None:
             print(f"{module}: missing; .venv/bin/pip install -e '.[compare]'", file=sys.stderr)
@@ -351,9 +295,9 @@ def main() -> int:
         report_stereo(options.output, list(compare_stereo(views, pictures)), text)
         shown = min(isos, key=lambda iso: abs(iso - SHOWN))
         stereo_pictures(views, pictures, (CLEAN, CAMERA, IID, HALF), shown)
-        programs = programs_of(options.pmvs, options.colmap)
-        if programs:
-            report_points(options.output, points_until_stopped(programs, views, pictures), text)
+        if options.pmvs:
+            found = compare_points(options.pmvs.absolute(), views, pictures)
+            report_points(options.output, found, text)
     except subprocess.CalledProcessError:
         return 1  # clpipe printed the reason
     except (ClpipeError, ProgramError, ValueError, OSError) as error:

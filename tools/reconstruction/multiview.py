@@ -1,10 +1,11 @@
-"""Points from all views at once, by programs that you build: PMVS2 and COLMAP's dense stereo.
+"""Points from all views at once, by PMVS2, a program that you build.
 
 PMVS2 implements Furukawa and Ponce 2010 ("Accurate, dense, and robust multiview stereopsis"). Small
 patches grow from features. PMVS2 keeps patches whose textures correlate by more than a threshold in
 enough views. For its file formats, see https://www.di.ens.fr/pmvs/documentation.html.
 """
 
+import re
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,10 +14,6 @@ import numpy as np
 from PIL import Image
 
 from clpipe.base.types import Array, Doubles, Mask
-from clpipe.chain.rendition import NOISY
-from clpipe.outputs.camera_formats import COLMAP, colmap
-from clpipe.outputs.output_pictures import OutputPicture
-from clpipe.reference.intrinsics import PINHOLE, Intrinsics
 from tools.reconstruction.views import SAME, View
 
 THRESHOLDS = (0.7, 0.9)  # of PMVS2's correlation: the default, and one for fewer, safer points
@@ -37,8 +34,7 @@ quad 2.5
 timages -1 0 {count}
 oimages 0
 """
-LIMIT = 3600  # s for each program
-SOURCES = 3  # nearest other views for COLMAP's stereo
+LIMIT = 3600  # s for each run
 
 
 class ProgramError(Exception):
@@ -80,86 +76,6 @@ def run_pmvs(
     return read_ply(folder / "models" / "option.ply")
 
 
-def write_colmap(folder: Path, views: Sequence[View], pictures: Sequence[Array]) -> None:
-    """Write the inputs of COLMAP's dense stereo into a folder: images/ and sparse/0.
-
-    Args:
-        folder: a folder, which is created.
-        views: the cameras.
-        pictures: the picture of each view, (height, width, 3) uint8.
-    """
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    (folder / COLMAP).mkdir(parents=True, exist_ok=True)
-    output_pictures = []
-    for view, picture in zip(views, pictures, strict=True):
-        name = f"{view.name}.png"
-        Image.fromarray(picture).save(folder / "images" / name)
-        height, width = view.depth.shape
-        fx, fy, cx, cy = view.k[0, 0], view.k[1, 1], view.k[0, 2], view.k[1, 2]
-        camera = Intrinsics(width, height, fx, fy, cx, cy, PINHOLE, {})
-        pose = tuple(map(tuple, view.r.tolist())), tuple(view.t.tolist())
-        output_pictures.append(OutputPicture(name, NOISY, camera, pose))
-    for name, text in colmap(output_pictures, output_pictures, {}).items():
-        (folder / name).write_text(text, encoding="utf-8")
-
-
-def run_colmap(
-    program: Path, folder: Path, views: Sequence[View], pictures: Sequence[Array], half: bool
-) -> tuple[Doubles, Array]:
-    """Run COLMAP's dense stereo, which needs CUDA, on all views.
-
-    COLMAP usually chooses partners and depth ranges from sparse points. There are none here, so
-    the function sets both.
-
-    Args:
-        program: the path of colmap.
-        folder: a folder for its files, which is created.
-        views: the cameras, with depth.
-        pictures: the picture of each view, (height, width, 3) uint8.
-        half: whether to use half resolution.
-
-    Returns:
-        The fused points, (n, 3) in m, and their colours, (n, 3) uint8.
-
-    Raises:
-        ProgramError: it fails.
-    """
-    write_colmap(folder, views, pictures)
-    dense = folder / "dense"
-    size = str(max(views[0].depth.shape) // (1 + half))
-    places = {"--image_path": folder / "images", "--input_path": folder / COLMAP}
-    undistorted = {**places, "--output_path": dense, "--max_image_size": size}
-    nearest = min(view.depth.min() for view in views)
-    farthest = max(view.depth.max() for view in views)
-    stereo = {
-        "--workspace_path": dense,
-        "--PatchMatchStereo.depth_min": nearest * (1 - SAME),
-        "--PatchMatchStereo.depth_max": farthest * (1 + SAME),
-    }
-    fusion = {"--workspace_path": dense, "--output_path": dense / "fused.ply"}
-    run([str(program), "image_undistorter", *words(undistorted)], folder)
-    (dense / "stereo" / "patch-match.cfg").write_text(partners(views), encoding="utf-8")
-    run([str(program), "patch_match_stereo", *words(stereo)], folder)
-    run([str(program), "stereo_fusion", *words(fusion)], folder)
-    return read_ply(dense / "fused.ply")
-
-
-def words(options: dict[str, object]) -> list[str]:
-    """Return options as words of a command."""
-    return [str(word) for option in options.items() for word in option]
-
-
-def partners(views: Sequence[View]) -> str:
-    """Return COLMAP's patch-match.cfg with the nearest other views of each view."""
-    places = np.array([-view.r.T @ view.t for view in views])
-    lines = []
-    for number, view in enumerate(views):
-        near = np.argsort(np.linalg.norm(places - places[number], axis=1), kind="stable")
-        names = ", ".join(f"{views[n].name}.png" for n in near[1 : SOURCES + 1])
-        lines += [f"{view.name}.png", names]
-    return "\n".join(lines) + "\n"
-
-
 def run(command: list[str], folder: Path) -> None:
     """Run a program, and write its output to log.txt in the folder.
 
@@ -183,27 +99,20 @@ def run(command: list[str], folder: Path) -> None:
 
 
 def read_ply(path: Path) -> tuple[Doubles, Array]:
-    """Read the points of a text or binary PLY, (n, 3), and their colours, (n, 3) uint8.
+    """Read the points of PMVS2's PLY, (n, 3), and their colours, (n, 3) uint8.
 
     Raises:
         ProgramError: the file cannot be read, or has no coloured points.
     """
-    types = {"float": "<f4", "uchar": "u1", "double": "<f8", "int": "<i4"}
     try:
-        head, _, body = path.read_bytes().partition(b"end_header\n")
-        lines = [line.split() for line in head.decode().splitlines()]
-        count = next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"])
-        fields = [(line[2], types[line[1]]) for line in lines if line[0] == "property"]
-        if ["format", "ascii", "1.0"] in lines:
-            table = np.array(body.split(), np.float64).reshape(count, len(fields))
-            columns = dict(zip([name for name, _ in fields], table.T, strict=True))
-        else:
-            columns = np.frombuffer(body, fields, count)
-        points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
-        names = ["diffuse_red", "diffuse_green", "diffuse_blue"]
-        names = names if names[0] in dict(fields) else ["red", "green", "blue"]
-        return points, np.stack([columns[name] for name in names], axis=1).astype(np.uint8)
-    except (OSError, ValueError, KeyError, StopIteration) as error:
+        head, _, body = path.read_text("utf-8").partition("end_header\n")
+        fields = re.findall(r"^property \w+ (\w+)$", head, re.MULTILINE)
+        table = np.array(body.split(), np.float64).reshape(-1, len(fields)).T
+        columns = dict(zip(fields, table, strict=True))
+        points = np.stack([columns[name] for name in "xyz"], axis=1)
+        colours = [columns[f"diffuse_{name}"] for name in ("red", "green", "blue")]
+        return points, np.stack(colours, axis=1).astype(np.uint8)
+    except (OSError, ValueError, KeyError) as error:
         raise ProgramError(f"{path}: expected coloured points, found {error!r}") from None
 
 

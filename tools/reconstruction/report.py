@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from clpipe.base.types import Array, Doubles, Floats
-from tools.pages.comparison_page import markdown
 from tools.reconstruction.pictures import CAMERA, CLEAN, HALF, IID, KINDS
 from tools.reconstruction.views import View
+from tools.shared.tables import markdown
 
 COLOURS = dict(
     zip(
@@ -23,7 +22,6 @@ COLOURS = dict(
 EMPTY = 255, 60  # grey levels of pixels without depth, and of the background of points
 POINT = 2  # px, side of a point
 TURN, TILT, ZOOM = 25.0, -15.0, 0.85  # view of points: degrees, and factor of the focal length
-GAP, HEAD = 6, 24  # px
 
 
 class Mean(NamedTuple):
@@ -109,8 +107,9 @@ def draw(path: Path, panels: Sequence[tuple[str, str, Table]], columns: int, fac
         columns: the number of panels in a row.
         factor: a factor for all values.
     """
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
+
+    from tools.shared.plots import save
 
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.4 * columns, 2.7 * rows + 0.5), layout="constrained")
@@ -137,8 +136,7 @@ def draw(path: Path, panels: Sequence[tuple[str, str, Table]], columns: int, fac
         axis.grid(alpha=0.3)
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "clpipe"}):  # small, and reproducible
-        figure.savefig(path, metadata={"Date": None})
+    save(figure, path)
 
 
 def depth_picture(depth: Floats, nearest: float, farthest: float) -> Array:
@@ -194,18 +192,3 @@ def cloud_picture(points: Doubles, colours: Array, view: View) -> Array:
     shown = np.broadcast_to(colours[order][:, None, None], (*x.shape, 3))
     image[y[inside], x[inside]] = shown[inside]
     return image
-
-
-def sheet(rows: Sequence[Sequence[tuple[str, Array]]]) -> Image.Image:
-    """Draw a sheet of pictures of one size, (height, width, 3) uint8, with names above them."""
-    height, width = rows[0][0][1].shape[:2]
-    columns = max(map(len, rows))
-    size = columns * (width + GAP) - GAP, len(rows) * (height + HEAD)
-    canvas = Image.new("RGB", size, "white")
-    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(16)
-    for row, pictures in enumerate(rows):
-        for column, (name, picture) in enumerate(pictures):
-            x, y = column * (width + GAP), row * (height + HEAD)
-            pen.text((x + 4, y + 2), name, "black", font)
-            canvas.paste(Image.fromarray(picture), (x, y + HEAD))
-    return canvas

@@ -13,11 +13,10 @@ The scene is built only from code, with meshes and procedural materials. One uni
 points right, y away from the cameras, and z up. An object's number is that of its texture.
 """
 
+import argparse
 import sys
 from math import radians
 from pathlib import Path
-
-import bpy
 
 # The contrast of each texture's noise around the mean.
 STRONG, WEAK, NONE = 1, 2, 3
@@ -104,8 +103,15 @@ def build():
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Make the scene of the experiment in Blender.")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="for the .blend files")
+    # Blender's own options are before "--".
+    words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    folder = parser.parse_args(words).folder.resolve()
+
+    import bpy
+
     build()
-    folder = Path(sys.argv[-1]).resolve()
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "colour.blend"))
     bpy.context.scene.cycles.filter_width = RAY
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "centres.blend"))

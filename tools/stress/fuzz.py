@@ -14,16 +14,18 @@ import os
 import random
 import resource
 import shutil
+import signal
 import struct
 import subprocess
 import sys
 import tempfile
-import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
+
+from tools.shared.options import parser_of
 
 CPU_SECONDS = 5.0  # for one case
 SECONDS = 60.0  # elapsed time for one case, which may wait for other processes
@@ -268,28 +270,30 @@ def make_seeds(folder: Path) -> list[Path]:
 
 
 def work(numbers: range, seed: int, files: list[Path], folder: Path) -> None:
-    """Run cases, and write the start and result of each to a file."""
+    """Run cases, and write the result of each to a file. Signals end a process that hangs."""
     faulthandler.enable()
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     with (folder / "progress").open("w", buffering=1, encoding="utf-8") as progress:
         for number in numbers:
             path = case(number, seed, files, folder)
-            progress.write(f"begin {number}\n")
+            signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
+            signal.setitimer(signal.ITIMER_REAL, SECONDS)
             try:
-                progress.write(f"end {attempt(path)}\n")
+                result = attempt(path)
             except Exception:
-                progress.write("end traceback\n")
+                result = "traceback"
                 print(f"case {number}", file=sys.stderr)
                 traceback.print_exc()
+            progress.write(f"{result}\n")
             path.unlink()
 
 
 def main() -> int:
     """Run the cases, and count their results."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("files", nargs="*", type=Path)
-    parser.add_argument("--cases", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
+    parser = parser_of(__doc__)
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="files to mutate")
+    parser.add_argument("--cases", type=int, default=2000, help="mutated files [%(default)s]")
+    parser.add_argument("--seed", type=int, default=0, help="of the mutations [%(default)s]")
     parser.add_argument("--keep", type=Path, help="a folder for files that cause failures")
     parser.add_argument("--from", dest="first", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
@@ -315,51 +319,28 @@ def main() -> int:
     return 1 if bad else 0
 
 
-def cpu_seconds(process: int) -> float:
-    """Return the CPU time that a process has used."""
-    fields = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def supervise(
     options: argparse.Namespace, folder: Path, first: int, counts: Counter[str]
 ) -> tuple[int, list[tuple[int, str]]]:
-    """Run cases in a process until it ends or hangs; return the next case and the failures."""
+    """Run cases in a process until it ends; return the next case and the failures."""
     progress = folder / "progress"
+    progress.write_text("", "utf-8")
     arguments = [f"--cases={options.cases}", f"--seed={options.seed}", f"--from={first}"]
     command = [sys.executable, "-m", "tools.stress.fuzz", *arguments, f"--folder={folder}"]
     command += map(str, options.files)
-    number, bad, at = first, [], 0
-    progress.write_text("", "utf-8")
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | LIMITS) as child:
-        since, used = time.monotonic(), 0.0
-        while True:
-            done = child.poll() is not None
-            lines = progress.read_text("utf-8").split("\n")[:-1]
-            for line in lines[at:]:
-                word, value = line.split()
-                if word == "begin":
-                    number = int(value)
-                    continue
-                counts[value] += 1
-                if value == "traceback":
-                    bad.append((number, value))
-                number += 1
-            if done:
-                break
-            if len(lines) > at or not lines:
-                since, used = time.monotonic(), cpu_seconds(child.pid)
-            at = len(lines)
-            if cpu_seconds(child.pid) - used > CPU_SECONDS or time.monotonic() - since > SECONDS:
-                child.kill()
-                child.wait()
-                counts["hang"] += 1
-                return number + 1, [*bad, (number, "hang")]
-            time.sleep(0.05)
-    if child.returncode:
-        counts["crash"] += 1
-        return number + 1, [*bad, (number, f"crash, status {child.returncode}")]
-    return number, bad
+    environment = os.environ | LIMITS
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, env=environment, check=False)
+    ended = progress.read_text("utf-8").split()
+    counts.update(ended)
+    failed = [(first + n, how) for n, how in enumerate(ended) if how == "traceback"]
+    number = first + len(ended)
+    if done.returncode == 0:
+        return number, failed
+    is_hang = -done.returncode in (signal.SIGPROF, signal.SIGALRM)
+    how = "hang" if is_hang else "crash"
+    counts[how] += 1
+    status = "" if is_hang else f", status {done.returncode}"
+    return number + 1, [*failed, (number, how + status)]
 
 
 if __name__ == "__main__":

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn import functional
 
+from tools.shared.pictures import enlarged, sheet
+from tools.shared.tables import markdown
+
 CROP = 160  # px, side of a crop
-LABEL = 14  # px, height of a label
+SCALE = 2  # its enlargement
 NOISY = "noisy"  # the pictures before denoising
 
 
@@ -42,20 +44,15 @@ def table(found: Mapping[str, Score], more: Mapping[str, Mapping[str, str]]) -> 
     """
     first = next(name for name in found if name != NOISY)
     headings = ["trained on", "PSNR, dB", "of each seed", "SSIM", f"{first} wins", *more]
-    lines = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
+    rows = []
     for regime, score in found.items():
         means = score.psnr.mean(0)
         wins = f"{(found[first].psnr.mean(0) > means).sum()} of {means.size}"
-        cells = [
-            regime,
-            f"{means.mean():.2f}",
-            "" if regime == NOISY else " ".join(f"{seed:.2f}" for seed in score.psnr.mean(1)),
-            f"{score.ssim.mean():.4f}",
-            "" if regime == first else wins,
-            *(column.get(regime, "") for column in more.values()),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        seeds = "" if regime == NOISY else " ".join(f"{seed:.2f}" for seed in score.psnr.mean(1))
+        cells = [regime, f"{means.mean():.2f}", seeds, f"{score.ssim.mean():.4f}"]
+        cells.append("" if regime == first else wins)
+        rows.append([*cells, *(column.get(regime, "") for column in more.values())])
+    return markdown(headings, rows)
 
 
 def joined(tables: Mapping[str, str]) -> str:
@@ -97,26 +94,21 @@ def corner(truth: Tensor) -> tuple[int, int]:
     return max(places, key=lambda at: float(luma[at[0] : at[0] + CROP, at[1] : at[1] + CROP].std()))
 
 
-def draw_crops(rows: Sequence[Sequence[tuple[str, Tensor]]], path: Path, scale: int = 2) -> None:
+def draw_crops(rows: Sequence[Sequence[tuple[str, Tensor]]], path: Path) -> None:
     """Write labelled crops of pictures side by side, with a row for each scene.
 
     Args:
         rows: labels and pictures of each scene, (3, height, width), 0 to 1. The last picture is the
             ground truth.
         path: the PNG.
-        scale: the enlargement.
     """
-    side = CROP * scale
-    across = max(map(len, rows))
-    sheet = Image.new("RGB", (side * across, (side + LABEL) * len(rows)), "white")
-    pen = ImageDraw.Draw(sheet)
-    for number, scene in enumerate(rows):
+    cells = []
+    for scene in rows:
         top, left = corner(scene[-1][1])
-        for column, (label, image) in enumerate(scene):
+        row = []
+        for label, image in scene:
             crop = image[:, top : top + CROP, left : left + CROP].clamp(0, 1)
             pixels = (crop * 255).round().byte().permute(1, 2, 0).numpy()
-            large = np.repeat(np.repeat(pixels, scale, 0), scale, 1)
-            at = side * column, (side + LABEL) * number
-            pen.text((at[0] + 3, at[1] + 1), label, fill="black")
-            sheet.paste(Image.fromarray(large), (at[0], at[1] + LABEL))
-    sheet.save(path)
+            row.append((label, enlarged(pixels, SCALE)))
+        cells.append(row)
+    sheet(cells).save(path)

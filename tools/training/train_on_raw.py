@@ -16,141 +16,36 @@ table therefore shows the value of each component for a sensor that has all of t
 divergence of the histogram of dark noise from the full model's, in nats.
 """
 
-import argparse
-import json
 import sys
-import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-import torch
-from torch import Tensor
-
-import clpipe
-from clpipe.dataset.arrays import packed
-from clpipe.images.read import ReadOptions, read_source
-from clpipe.stage import Kind
-from clpipe.torch import RawNoise
-from tools.training.figures import NOISY, scores, table
-from tools.training.networks import denoised, train
-from tools.training.patches import BATCH, PATCH, Batch, augmented, random_below
-
-REGIMES = ("full", "poisson-gaussian", "iid")
-PLAIN = ("prnu", "defect_pixels", "dark_current", "random_telegraph", "dsnu")
-PLAIN += ("dark_shading", "row_noise", "column_noise", "banding")
-OFFSETS = ["black_level_error"]  # dark frames remove it, and pictures do not show it
-DIMMED = (1 / 100, 1 / 10)  # range of light, relative to a normal exposure
-LIGHTS = (1 / 80, 1 / 30, 1 / 12)  # light of test raws
-TEST_SEED = 77  # for noise that training does not use
-BINS = np.linspace(-8, 8, 129)  # in sigma of the full model's dark noise
-NORMAL = {"method": "gaussian", "tukey_lambda": 0.14}  # this Tukey lambda is nearly Gaussian
-
-
-def clean_raws(paths: Sequence[Path], camera: str) -> list[Tensor]:
-    """Return the planes of noise-free mosaics, (4, height, width), as signal."""
-    pipeline = clpipe.Pipeline(
-        camera=camera, iso=1600, until="normalize", skip=["noise"], quantize={"bits": 16}
-    )
-    pattern = pipeline.chain.filter_array.pattern
-    found = []
-    for path in paths:
-        pixels = read_source(path, Kind.RGB, ReadOptions()).pixels.astype(np.float32)
-        mosaic = pipeline.process(pixels, path.name).image
-        height, width = (side // 2 * 2 for side in mosaic.shape)
-        found.append(torch.from_numpy(packed(mosaic[:height, :width], pattern)).clamp(0, 1))
-    return found
-
-
-def models(camera: str, iso: Sequence[float], seed: int) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Return a function for each regime that adds noise to a batch of planes."""
-    drawn = {"log_uniform": list(iso)}
-    full = RawNoise(camera, drawn, seed=seed, skip=OFFSETS)
-    plain = RawNoise(camera, drawn, seed=seed, skip=[*OFFSETS, *PLAIN], sensor_noise=NORMAL)
-    random = torch.Generator().manual_seed(seed)
-
-    def iid(clean: Tensor) -> Tensor:
-        sigma = (full(clean) - clean).square().mean((1, 2, 3), keepdim=True).sqrt()
-        return clean + sigma * torch.randn(clean.shape, generator=random)
-
-    return {"full": full, "poisson-gaussian": plain, "iid": iid}
-
-
-def divergence(noise: Tensor, of_full: Tensor) -> float:
-    """Return the KLD of a histogram of noise from the full model's, in nats."""
-    sigma = float(of_full.std())
-    counts = [
-        np.histogram((values / sigma).clamp(-7.99, 7.99).numpy(), BINS)[0] + 0.5
-        for values in (of_full, noise)
-    ]
-    p, q = (count / count.sum() for count in counts)
-    return float((p * np.log(p / q)).sum())
+from clpipe.base.errors import ClpipeError
+from tools.shared.options import count_of, parser_of
 
 
 def main() -> None:
-    """Train, compare, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("renders", nargs="+", type=Path, metavar="RENDER")
-    parser.add_argument("--test", nargs="+", type=Path, required=True, metavar="RENDER")
-    parser.add_argument("--camera", default="sony-a7s2", help="[sony-a7s2]")
-    parser.add_argument(
-        "--iso", nargs=2, type=float, default=(1600, 25600), metavar=("LOW", "HIGH")
-    )
-    parser.add_argument("--steps", type=int, default=2000, help="steps of training [2000]")
-    parser.add_argument("--seeds", type=int, default=2, help="number of trainings [2]")
-    parser.add_argument("-o", "--output", type=Path, default=Path("raw.json"), help="[raw.json]")
+    """Check the options, and train."""
+    parser = parser_of(__doc__)
+    add = parser.add_argument
+    add("renders", nargs="+", type=Path, metavar="RENDER")
+    add("--test", nargs="+", type=Path, required=True, metavar="RENDER")
+    add("--camera", default="sony-a7s2", help="[sony-a7s2]")
+    add("--iso", nargs=2, type=float, default=(1600, 25600), metavar=("LOW", "HIGH"))
+    add("--steps", type=count_of, default=2000, help="steps of training [2000]")
+    add("--seeds", type=count_of, default=2, help="number of trainings [2]")
+    add("-o", "--output", type=Path, default=Path("raw.json"), help="[raw.json]")
     options = parser.parse_args()
-    for path in options.test:
-        if path.resolve() in [each.resolve() for each in options.renders]:
-            parser.error(
-                f"--test: {path} is also a training render; remove it from one of the lists"
-            )
-    clean, held_out = (clean_raws(each, options.camera) for each in (options.renders, options.test))
-    tests, truths = [], [raw for raw in held_out for _ in LIGHTS]
-    drawn = {"log_uniform": list(options.iso)}
-    test_noise = RawNoise(options.camera, drawn, seed=TEST_SEED, skip=OFFSETS)
-    for number, raw in enumerate(held_out):
-        for light in LIGHTS:
-            tests.append(test_noise(raw * light, f"{number} {light:.4f}") / light)
-    dark = torch.zeros(64, 4, PATCH, PATCH)
-    kept = models(options.camera, options.iso, TEST_SEED)
-    of_full = kept["full"](dark)
-    found = {NOISY: scores([[noisy.clamp(0, 1) for noisy in tests]], truths)}
-    for regime in REGIMES:
-        start, of_seeds = time.monotonic(), []
-        for seed in range(1, options.seeds + 1):
-            batch = batches(clean, models(options.camera, options.iso, seed)[regime])
-            network = train(batch, len(clean[0]), options.steps, seed)
-            of_seeds.append([denoised(network, noisy) for noisy in tests])
-        found[regime] = scores(of_seeds, truths)
-        seconds = time.monotonic() - start
-        print(f"{regime}: {found[regime].psnr.mean():.2f} dB, {seconds:.0f} s", flush=True)
-    klds = {regime: f"{divergence(noise(dark), of_full):.4f}" for regime, noise in kept.items()}
-    print(f"\n{table(found, {'KLD': klds})}")
-    report = {regime: score.record() for regime, score in found.items()}
-    options.output.write_text(json.dumps(report, indent=2), "utf-8")
+    both = {path.resolve() for path in options.renders} & {path.resolve() for path in options.test}
+    if both:
+        parser.error(f"--test: {min(both)} is also a training render; remove it from one list")
 
+    from tools.training.on_raw import run  # PyTorch is missing, or takes seconds to load
 
-def batches(clean: Sequence[Tensor], noise: Callable[[Tensor], Tensor]) -> Batch:
-    """Return a source of patches in dim light, brightened again, and their ground truth."""
-    low, high = np.log(DIMMED)
-
-    def batch(generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        patches = torch.empty(BATCH, 4, PATCH, PATCH)
-        for patch in patches:
-            raw = clean[random_below(len(clean), generator)]
-            y, x = (random_below(side - PATCH + 1, generator) for side in raw.shape[1:])
-            patch.copy_(augmented(raw[:, y : y + PATCH, x : x + PATCH], random_below(8, generator)))
-        light = torch.exp(low + (high - low) * torch.rand(BATCH, 1, 1, 1, generator=generator))
-        return noise(patches * light) / light, patches
-
-    return batch
+    run(options)
 
 
 if __name__ == "__main__":
     try:
         main()
-    except (clpipe.ClpipeError, OSError) as error:
+    except (ClpipeError, OSError) as error:
         sys.exit(f"error: {error}")

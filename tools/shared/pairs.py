@@ -1,4 +1,4 @@
-"""Pictures of real cameras, each with the mean of many of the same scene."""
+"""Pictures of real cameras, each with the mean of many pictures of its scene."""
 
 from dataclasses import dataclass
 from pathlib import Path
