@@ -117,6 +117,8 @@ CASES = {
     "default": Case({}, size=(61, 203)),
     "sums": Case(GRAY_WORLD, size=(150, 203)),
     "strip": Case(GRAY_WORLD, size=(901, 9)),
+    # Two functions of one file read the mosaic, whose gains are recomputed at their taps.
+    "edge_directed": Case({**GRAY_WORLD, "demosaic": {"method": "edge_directed"}}),
     "GBRG": Case({"mosaic": {"pattern": "GBRG"}, "white_balance": {"method": "white_patch"}}),
     "histogram": Case({"exposure": {"method": "auto"}}),
     "resampled": Case({"distortion": LENS, "resize": {"scale": 0.6}}, tile=()),

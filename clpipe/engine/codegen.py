@@ -175,12 +175,13 @@ def _functions(builder: KernelBuilder, launch: Launch, seen: set[str]) -> str:
 def _functions_of_bands(builder: KernelBuilder, bands: Bands, seen: set[str]) -> str:
     """Return the functions that launches in bands call.
 
-    Each launch has a tap function with its own name. The file of a stencil is compiled for the taps
+    Each launch has a tap function with its own name, or shares an equal one. The file of a stencil is compiled for the taps
     and the columns of the launch that it opens, even if an earlier launch needs another function of
     the file.
     """
     texts: list[str] = []
     with_taps: set[int] = set()
+    first_with: dict[str, int] = {}  # the first launch with a text of the tap function
     openers: dict[str, int] = {}
     for number, part in enumerate(bands.parts):
         if part.stencil:
@@ -204,7 +205,12 @@ def _functions_of_bands(builder: KernelBuilder, bands: Bands, seen: set[str]) ->
             for read in bands.parts[number].reads:
                 for op in read.prologue:
                     include(op.kernel)
-            texts.append(tap_function(builder, bands.parts[number], str(number)))
+            first = first_with.setdefault(tap_function(builder, bands.parts[number]), number)
+            if first == number:
+                texts.append(tap_function(builder, bands.parts[number], str(number)))
+            else:  # of one type, because the functions of a file are compiled once
+                texts.append(f"typedef src_image{first} src_image{number};\n")
+                texts.append(f"#define src_tap{number} src_tap{first}\n")
 
     for number, part in enumerate(bands.parts):
         add_taps(number)
