@@ -175,9 +175,9 @@ def _functions(builder: KernelBuilder, launch: Launch, seen: set[str]) -> str:
 def _functions_of_bands(builder: KernelBuilder, bands: Bands, seen: set[str]) -> str:
     """Return the functions that launches in bands call.
 
-    Each launch has a tap function with its own name, or shares an equal one. The file of a stencil is compiled for the taps
-    and the columns of the launch that it opens, even if an earlier launch needs another function of
-    the file.
+    Each launch has a tap function with its own name, or shares an equal one. The file of a stencil
+    is compiled for the taps and the columns of the launch that it opens, even if an earlier launch
+    needs another function of the file.
     """
     texts: list[str] = []
     with_taps: set[int] = set()
