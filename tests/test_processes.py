@@ -1,7 +1,6 @@
 """A run with several processes: the same bytes, even if a process dies."""
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -14,13 +13,17 @@ import pytest
 import clpipe as package
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.batch import processes
-from clpipe.batch.local_worker import ProcessConfig
 from clpipe.batch.run_log import read_log
-from clpipe.batch.spec import RunSpec
-from tests.conftest import ROOT, contents, statuses, written
-from tests.held import GO, HOLDING_PROCESSES, finish, interrupt, start, wait_until
+from tests.conftest import ROOT, contents, run_python, statuses, written
+from tests.held import GO, HOLDING_PROCESSES, finish, interrupt, plant, start, wait_until
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(autouse=True)
+def _planted_nothing(monkeypatch):
+    monkeypatch.setattr(processes, "prepare", processes.prepare)  # restored after plant()
+
 
 RUN = ("-o", "out", "--iso", 3200)
 TWO = (*RUN, "--processes", 2)
@@ -89,15 +92,37 @@ def test_a_process_that_is_killed_takes_nothing_with_it(clpipe, renders):
     assert not [name for name in written(Path("out")) if ".part." in name]
 
 
-def test_processes_end_with_the_one_that_started_them(clpipe, renders):
+@pytest.mark.parametrize("end", ["killed", "a second signal"])
+def test_processes_end_with_the_one_that_started_them(clpipe, renders, end):
     renders(30)
     process, others = held_run()
-    process.kill()
-    finish(process)
+    if end == "killed":
+        process.kill()
+    else:
+        interrupt(process)
+        process.send_signal(signal.SIGTERM)
+    printed = finish(process)  # by all processes, until the last one has ended
+    assert [line for line in printed.splitlines() if not line.startswith("in/")] == []
     wait_until(lambda: not any(map(is_running, others)), "the end of the other processes")
+    assert not semaphores(process.pid)
     assert pictures() <= 20
     result = clpipe("run", "in", *RUN)
     assert "30 of 30 images done (" in result.stderr
+
+
+def test_processes_end_while_they_start(renders):
+    renders(4)
+    ending = "import os\nfrom clpipe.batch import processes\n"
+    ending += "processes.Processes._outcomes = lambda *arguments: os._exit(9)"
+    process = start("in", *TWO, planted=ending)
+    assert finish(process) == ""  # until the last process has ended
+    assert process.returncode == 9
+    assert not semaphores(process.pid)
+
+
+def semaphores(pid):
+    """Return the files of the semaphores that a process has created."""
+    return list(Path("/dev/shm").glob(f"sem.loky-{pid}-*"))
 
 
 def test_stopped_once_what_is_begun_is_finished(renders):
@@ -120,9 +145,9 @@ def test_stopped_once_what_is_begun_is_finished(renders):
 def test_an_image_that_kills_processes_fails_alone(clpipe, renders, monkeypatch):
     renders(9)
     Path("in/r005.exr").rename("in/deadly.exr")
-    monkeypatch.setattr(processes, "START", f"exec({DEADLY!r}); {processes.START}")
+    plant(DEADLY)
     result = clpipe("run", "in", *TWO, "--device", "numpy", status=1)
-    assert "in/deadly.exr: killed the process that took it, 3 times; the last one by signal 9" in (
+    assert "in/deadly.exr: killed the process that took it, 2 times; the last one by signal 9" in (
         result.stderr
     )
     assert "8 of 9 images done, 1 failed" in result.stderr
@@ -132,7 +157,7 @@ def test_an_image_that_kills_processes_fails_alone(clpipe, renders, monkeypatch)
 
 def test_processes_that_end_as_they_start(renders, monkeypatch):
     renders(3)
-    monkeypatch.setattr(processes, "START", "sys.exit(7)")
+    plant("import os; os._exit(7)")
     run = package.run("in", "out", processes=2)
     with pytest.raises(DeviceError, match=r"3 processes in a row ended before .* with status 7"):
         list(run)
@@ -152,16 +177,27 @@ def test_errors_of_a_process_are_the_runs(renders):
 def test_whoever_stops_listening_leaves_no_process(renders):
     renders(40)
     run = iter(package.run("in", "out", processes=2, device="numpy"))
-    assert next(run).status == "done"
-    before = threads_of_pipes()
+    first = next(run)
+    assert first.status == "done" and is_running(first.pid)
     run.close()
-    assert threads_of_pipes() <= before
+    assert not is_running(first.pid)
+    assert not semaphores(os.getpid())
     assert not (Path("out") / ".part").exists()
     assert pictures() < 40
 
 
-def threads_of_pipes():
-    return len(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
+SCRIPT = """
+import clpipe
+print("start")
+print(*(outcome.status for outcome in clpipe.run("in", "out", processes=2, device="numpy")))
+"""
+
+
+def test_a_script_needs_no_guard_and_stdout_is_its_own(renders):
+    renders(3)
+    Path("script.py").write_text(SCRIPT)
+    done = run_python("script.py")
+    assert (done.stdout, done.stderr) == ("start\ndone done done\n", "")
 
 
 BROKEN = """
@@ -179,7 +215,7 @@ def test_a_kernel_that_does_not_compile_ends_the_run(write_exr, clpipe, monkeypa
     """The run also ends if all images are distributed and decoders wait."""
     for i in range(2):
         write_exr(f"in/r{i}.exr", np.zeros((side, side, 3), np.float32))
-    monkeypatch.setattr(processes, "START", f"exec({BROKEN!r}); {processes.START}")
+    plant(BROKEN)
     stderr = clpipe("run", "in", *TWO, "--device", "numpy", status=3).stderr
     assert "a kernel does not compile" in stderr
 
@@ -193,35 +229,17 @@ ImageWorker.begin = lambda *arguments: os._exit(9)
 
 def test_processes_that_all_die_end_the_run(renders, monkeypatch):
     renders(20)
-    monkeypatch.setattr(processes, "START", f"exec({ALWAYS!r}); {processes.START}")
-    monkeypatch.setattr(processes, "MAX_FRUITLESS", 4)
+    plant(ALWAYS)
+    monkeypatch.setitem(processes.MAX_DEATHS, processes.MADE, 4)
     with pytest.raises(DeviceError, match=r"4 processes in a row ended before .* with status 9"):
         list(package.run("in", "out", processes=2, device="numpy"))
 
 
-def test_ctrl_c_does_not_reach_a_process_before_its_first_line(renders, monkeypatch):
+def test_ctrl_c_does_not_reach_a_process(renders):
     renders(2)
-    interrupted = "import os, signal; os.kill(os.getpid(), signal.SIGINT); "
-    monkeypatch.setattr(processes, "PROGRAM", interrupted + processes.PROGRAM)
+    plant("import os, signal; os.kill(os.getpid(), signal.SIGINT); print('noise')")
     run = package.run("in", "out", processes=2, device="numpy")
     assert [outcome.status for outcome in run] == ["done"] * 2
-
-
-@pytest.mark.parametrize("gone", ["before it says what to do", "after it says what to do"])
-def test_a_process_whose_run_has_gone_ends_silently(renders, monkeypatch, gone):
-    renders(1)
-    ours, theirs = multiprocessing.Pipe()
-    if gone.startswith("after"):
-        run = package.run("in", "out", device="numpy")
-        ours.send((RunSpec(run._request, run.execution, run.jobs[0]), ProcessConfig(0, 1, 1)))
-    ours.close()
-    ended = subprocess.run(
-        [sys.executable, "-c", f"import sys; {processes.START}", str(theirs.fileno())],
-        pass_fds=[theirs.fileno()],
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    assert (ended.returncode, ended.stderr) == (1, b"")
 
 
 def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tmp_path, clpipe):
