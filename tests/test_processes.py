@@ -1,20 +1,24 @@
 """A run with several processes: the same bytes, even if a process dies."""
 
+import errno
+import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from loky import ProcessPoolExecutor
 
 import clpipe as package
 from clpipe.base.errors import DeviceError, RequestError
+from clpipe.base.processors import available_processors
+from clpipe.base.system import processor_numbers
 from clpipe.batch import processes
 from clpipe.batch.run_log import read_log
-from tests.conftest import ROOT, contents, run_python, statuses, written
+from tests.conftest import contents, run_python, statuses, written
 from tests.held import GO, HOLDING_PROCESSES, finish, interrupt, plant, start, wait_until
 
 pytestmark = pytest.mark.slow
@@ -244,27 +248,81 @@ def test_ctrl_c_does_not_reach_a_process(renders):
 
 def test_nothing_runs_from_the_working_directory_and_nothing_is_left(renders, tmp_path, clpipe):
     renders(4)
-    Path("json.py").write_text("raise SystemExit('not yours')\n")
-    Path("signal.py").write_text("raise SystemExit('not yours')\n")
+    for name in ("json", "signal", "loky", "argparse", "multiprocessing"):
+        Path(f"{name}.py").write_text("raise SystemExit('not yours')\n")
     place = tmp_path / "temporary"
-    place.mkdir()
-    command = [sys.executable, "-P", "-m", "clpipe", "run", "in", *map(str, TWO)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(place)}
-    done = subprocess.run([*command, "--device", "numpy"], env=environment, capture_output=True)
-    assert done.returncode == 0, done.stderr
+    (place / "bin").mkdir(parents=True)
+    program = place / "bin" / "program.py"
+    program.write_text("from clpipe.__main__ import main\nmain()\n")
+    done = run_python(program, "run", "in", *TWO, "--device", "numpy", "--quiet", TMPDIR=place)
+    assert done.stdout == done.stderr == ""
     assert pictures() == 4
+    program.unlink()
     assert not [path for path in place.rglob("*") if path.is_file()]
 
 
 def test_fewer_processes_where_the_system_gives_no_more(renders, monkeypatch):
     renders(6)
-    start_ = processes.Processes._start
+    pools = itertools.count()
 
-    def limited(self, number):
-        if number:
-            raise RequestError("no process can be started")
-        return start_(self, number)
+    def limited(*arguments, **options):
+        if next(pools):
+            raise OSError(errno.EAGAIN, "no more processes")
+        return ProcessPoolExecutor(*arguments, **options)
 
-    monkeypatch.setattr(processes.Processes, "_start", limited)
+    monkeypatch.setattr("loky.ProcessPoolExecutor", limited)
     run = package.run("in", "out", processes=3, device="numpy")
     assert [outcome.status for outcome in run] == ["done"] * 6
+    with pytest.raises(RequestError, match=r"2: no process can be started \(no more processes\)"):
+        list(package.run("in", "other", processes=2, device="numpy"))
+
+
+def test_a_process_that_dies_while_it_waits_is_replaced(renders):
+    renders(30)
+    run = package.run("in", "out", processes=2, device="numpy")
+    begun = iter(run)
+    os.kill(next(begun).pid, signal.SIGKILL)  # nobody has given it more than the first image
+    time.sleep(1)
+    assert sorted(outcome.status for outcome in begun) == ["done"] * 29
+
+
+def test_log_lines_of_processes_appear_once(renders, caplog):
+    renders(20)
+    plant(LOGGING)
+    with caplog.at_level("INFO"):
+        list(package.run("in", "out", processes=2, device="numpy"))
+    assert [r.levelname for r in caplog.records if r.getMessage() == "at work"] == ["WARNING"]
+
+
+LOGGING = """
+import logging
+from clpipe.batch.work import ImageWorker
+begin = ImageWorker.begin
+def logged(*arguments):
+    logging.getLogger("clpipe.batch.work").warning("at %s", "work")
+    return begin(*arguments)
+ImageWorker.begin = logged
+"""
+
+
+def test_processors_are_divided(renders):
+    available = processor_numbers()
+    if len(available) < 2 or len(available) != available_processors():
+        pytest.skip("needs two processors")
+    renders(8)
+    plant(BOUND)
+    list(package.run("in", "out", processes=2, device="numpy"))
+    bound = [json.loads(path.read_text()) for path in Path().glob("bound.*")]
+    assert sorted(number for numbers in bound for number in numbers) == available
+
+
+BOUND = """
+import json, os, pathlib
+from clpipe.batch.work import ImageWorker
+runners = ImageWorker.runners
+def noted(*arguments):
+    numbers = sorted(os.sched_getaffinity(0))
+    pathlib.Path("bound." + str(os.getpid())).write_text(json.dumps(numbers))
+    return runners(*arguments)
+ImageWorker.runners = noted
+"""

@@ -30,7 +30,7 @@ class ChunkReport:
         seconds: the time since the worker got its last chunk.
         error: the error that ends the run, if any.
         unfinished: the number of jobs that the worker has begun. It reports them later.
-        records: what the worker has logged.
+        records: the log records of the worker.
     """
 
     outcomes: Sequence[Outcome]
@@ -73,9 +73,6 @@ class Chunks:
     suspects: deque[Job] = field(default_factory=deque)
     size: int = FIRST_CHUNK
 
-    def __bool__(self) -> bool:
-        return bool(self.jobs or self.suspects)
-
     def cut(self, count: int, least: int = 1) -> list[Job]:
         """Return the next chunk.
 
@@ -98,8 +95,7 @@ class ChunkExecutor(ABC):
     """An :class:`~clpipe.batch.sinks.Executor` whose jobs are done by workers.
 
     A derived class submits calls to workers, and puts the future of each call that has ended into
-    ``_finished``. ``_held`` contains the jobs of its worker by their stems, and whether the worker
-    tests one suspect.
+    ``_finished``. ``_held`` contains the jobs of its worker, by their stems.
 
     Args:
         spec: the run.
@@ -112,7 +108,8 @@ class ChunkExecutor(ABC):
         self.is_stopping = False
         self._chunks = Chunks(short, long)
         self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
-        self._held: dict[Any, tuple[Mapping[str, Job], bool]] = {}
+        self._held: dict[Any, Mapping[str, Job]] = {}
+        self._suspected: set[str] = set()  # the stems of jobs whose worker has died once
         self._logged: set[str] = set()
 
     def stop(self) -> None:
@@ -186,13 +183,13 @@ class ChunkExecutor(ABC):
             raise failure
 
     def _report(self, future: Any) -> ChunkReport:
-        held, alone = self._held.pop(future)
+        held = self._held.pop(future)
         try:
             return self._result(future, held)
         except WorkerDiedError as death:
-            if alone:
+            if held.keys() <= self._suspected:
                 return self._failed(held, str(death))
-            # Another job of these workers may have caused the deaths.
+            self._suspected |= held.keys()
             self._chunks.suspects.extend(held.values())
             return ChunkReport((), 0.0)
 

@@ -209,12 +209,12 @@ class Cluster(ChunkExecutor):
         while self._chunks.jobs and len(self._held) <= threads:
             self._submit(self._chunks.cut(threads + 1))
         if self._chunks.suspects and not self._held:
-            self._submit([self._chunks.suspects.popleft()], alone=True)
+            self._submit([self._chunks.suspects.popleft()])
         return bool(self._held)
 
-    def _submit(self, chunk: list[Job], alone: bool = False) -> None:
+    def _submit(self, chunk: list[Job]) -> None:
         future = self._client.submit(run_chunk, self._spec, chunk, pure=False, retries=RETRIES)
-        self._held[future] = ({job.stem: job for job in chunk}, alone)
+        self._held[future] = {job.stem: job for job in chunk}
         future.add_done_callback(self._finished.put)
 
     def _result(self, future: Any, held: Mapping[str, Job]) -> ChunkReport:

@@ -22,7 +22,8 @@ from typing import NoReturn
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.process_folder import process_folder
-from clpipe.base.system import bind_to_processors
+from clpipe.base.processors import available_processors
+from clpipe.base.system import bind_to_processors, processor_numbers
 from clpipe.base.transfers import TRANSFERS
 from clpipe.base.urls import Stamp, remember_stamps
 from clpipe.batch.chunks import ChunkReport
@@ -31,26 +32,24 @@ from clpipe.batch.spec import RunSpec, shifted
 from clpipe.engine.device import Device, open_devices
 from clpipe.inputs.find import Job
 
+# The names up to PoCL 3.1, and since PoCL 4.
+THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+
 
 @dataclass(frozen=True)
-class ProcessConfig:
+class Part:
     """One process's part of a run.
 
     Args:
         number: its number, from 0.
         count: the number of processes.
-        threads: the number of threads if the run does not set it.
-        processors: the processors that it is bound to. () binds it to none.
-        sequential: whether a single thread makes the images, see :mod:`clpipe.batch.threads`.
-        level: the lowest level that is logged.
+        is_small: whether a single thread makes the images if there is one processor, see
+            :mod:`clpipe.batch.threads`.
     """
 
     number: int
     count: int
-    threads: int
-    processors: tuple[int, ...] = ()
-    sequential: bool = False
-    level: int = logging.INFO
+    is_small: bool
 
 
 class _Worker:
@@ -58,17 +57,20 @@ class _Worker:
 
     Args:
         spec: the run.
-        config: this process's part of it.
+        part: this process's part of it.
 
     Raises:
         DeviceError: there is no usable device.
     """
 
-    def __init__(self, spec: RunSpec, config: ProcessConfig) -> None:
-        execution, share = spec.execution, (config.number, config.count)
+    def __init__(self, spec: RunSpec, part: Part) -> None:
+        processors = _take_processors(part.number, part.count)
+        for name in THREADS:
+            os.environ.setdefault(name, str(processors))
+        execution, share = spec.execution, (part.number, part.count)
         devices: list[Device | None] = [*open_devices(execution.devices, execution.memory, share)]
-        in_flight = 1 if config.sequential and len(devices) <= 1 else None
-        self.batch = spec.batch(devices or [None], config.threads, config.count, in_flight)
+        in_flight = 1 if processors == 1 and part.is_small and len(devices) <= 1 else None
+        self.batch = spec.batch(devices or [None], processors, part.count, in_flight)
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._outcomes = self.batch.run(iter(self._jobs.get, None))
         self.unfinished = 0  # jobs that will have an outcome
@@ -99,21 +101,29 @@ _halted = threading.Event()
 _records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
 
 
-def prepare(connection: Connection, config: ProcessConfig) -> None:
+def _take_processors(number: int, count: int) -> int:
+    """Bind this process to its part of the processors, if it has some, and return their number."""
+    numbers, available = processor_numbers(), available_processors()
+    if not len(numbers) == available >= count:
+        return max(available // count, 1)
+    own = numbers[number * available // count : (number + 1) * available // count]
+    bind_to_processors(own)
+    return len(own)
+
+
+def prepare(connection: Connection, level: int) -> None:
     """Prepare this process for a run.
 
     Args:
         connection: gets a message if the run stops, and is closed when the run's process ends.
-        config: this process's part of the run.
+        level: the lowest level that is logged.
     """
     os.dup2(2, 1)  # libraries may print; stdout is for the run's own output
-    if config.processors:
-        bind_to_processors(config.processors)
     threading.Thread(target=_watch, args=(connection,), daemon=True).start()
     Finalize(None, _finish, exitpriority=0)
     gc.freeze()  # imported modules remain in use, so the collector need not visit them
     logger = logging.getLogger("clpipe")
-    logger.setLevel(config.level)
+    logger.setLevel(level)
     logger.addHandler(QueueHandler(_records))
 
 
@@ -146,7 +156,7 @@ def _watch(connection: Connection) -> None:
 
 def run_chunk(
     spec: RunSpec,
-    config: ProcessConfig,
+    part: Part,
     jobs: Collection[Job],
     stamps: Mapping[str, Stamp],
     limit: int,
@@ -155,7 +165,7 @@ def run_chunk(
 
     Args:
         spec: the run.
-        config: this process's part of it.
+        part: this process's part of it.
         jobs: the jobs.
         stamps: known stamps of their URLs.
         limit: the number of jobs that may be unfinished.
@@ -166,12 +176,12 @@ def run_chunk(
     error, unfinished = None, 0
     try:
         if not _workers:
-            _workers[config.number] = _Worker(spec, config)
-        worker = _workers[config.number]
+            _workers[part.number] = _Worker(spec, part)
+        worker = _workers[part.number]
         if _halted.is_set():
             worker.batch.stop()
         for outcome in worker.outcomes(jobs, limit):
-            outcomes.append(shifted(outcome, 0.0, f"{config.number} "))
+            outcomes.append(shifted(outcome, 0.0, f"{part.number} "))
         unfinished = worker.unfinished
     except ClpipeError as problem:
         error = problem

@@ -14,25 +14,21 @@ import os
 import re
 from collections import Counter
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import resource_tracker as standard_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from loky.backend import get_context
-from loky.backend import resource_tracker as loky_tracker
-from loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
-
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.memory import available_memory
 from clpipe.base.processors import available_processors
-from clpipe.base.system import blocked_signals, processor_numbers
+from clpipe.base.system import blocked_signals
 from clpipe.base.urls import listed_stamps
 from clpipe.batch.chunks import ChunkExecutor, ChunkReport, WorkerDiedError
 from clpipe.batch.interrupt import SIGNALS
-from clpipe.batch.local_worker import ProcessConfig, prepare, run_chunk
+from clpipe.batch.local_worker import Part, prepare, run_chunk
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec
 from clpipe.images.claims import MemoryClaim
@@ -56,8 +52,6 @@ SHORT_CHUNK, LONG_CHUNK = 0.5, 2.0  # s; chunks grow and shrink at these times
 OPENED, MADE = "opened a device", "made an image"
 MAX_DEATHS = {OPENED: 3, MADE: 20}
 
-# The names up to PoCL 3.1, and since PoCL 4.
-THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 # Python imports no modules from the working directory, and Loky restarts no large process.
 ENVIRONMENT = {"PYTHONSAFEPATH": "1", "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
 TRACKERS = {"PYTHONSAFEPATH": "1", "PYTHONWARNINGS": "ignore"}
@@ -94,20 +88,20 @@ class _Process:
     """A process of the run: a pool with one worker, so its death breaks only this pool.
 
     Args:
-        config: its part of the run.
+        part: its part of the run.
         pool: calls functions in it.
         connection: gets a message to stop the process; the process ends if it is closed.
         held: its jobs without an outcome, by stem.
+        call: the last call.
         is_ready: whether it has opened its devices.
-        is_busy: whether a call runs.
     """
 
-    config: ProcessConfig
-    pool: ProcessPoolExecutor
+    part: Part
+    pool: Any
     connection: Connection
     held: dict[str, Job] = field(default_factory=dict)
+    call: Any = None
     is_ready: bool = False
-    is_busy: bool = False
 
     def close(self, kill: bool = False) -> None:
         """End it when it has done its jobs, or at once, and wait for its end."""
@@ -129,7 +123,6 @@ class Processes(ChunkExecutor):
         self._count = count
         self._is_small = claim.megapixels <= SMALL_MEGAPIXELS
         self._processes: dict[int, _Process] = {}
-        self._callers: dict[Any, _Process] = {}  # by the futures of calls
         # Whether a process has compiled the kernels, which are then cached.
         self._is_compiled = False
         # Deaths of processes in a row that had not reached a milestone.
@@ -148,17 +141,10 @@ class Processes(ChunkExecutor):
         try:
             _start_trackers()
             for number in range(self._count):
-                try:
-                    self._start(number)
-                except RequestError:
-                    if not self._processes:
-                        raise
-                    self._count = number  # the system allows no more processes
-                    break
+                self._start(number)
             yield from self._outcomes(all_jobs)
         finally:
-            if self._held:
-                self._halt()
+            self._halt()
             with ThreadPoolExecutor(self._count) as threads:
                 threads.map(_Process.close, self._processes.values())
             self._remove_unfinished(all_jobs)
@@ -167,80 +153,76 @@ class Processes(ChunkExecutor):
         """Start a process.
 
         Raises:
-            RequestError: the system refuses.
+            RequestError: the system allows none. If it allows no more, the others do without.
         """
-        available, count = processor_numbers(), self._count
-        share = max(available_processors() // count, 1)
-        own_processors: tuple[int, ...] = ()
-        if len(available) == available_processors() >= count:
-            own_processors = tuple(
-                available[number * len(available) // count : (number + 1) * len(available) // count]
-            )
-            share = len(own_processors)
-        sequential = share == 1 and self._is_small
+        from loky import ProcessPoolExecutor
+        from loky.backend import get_context
+
         level = logging.getLogger("clpipe").getEffectiveLevel()
-        config = ProcessConfig(number, count, share, own_processors, sequential, level)
-        limits = {name: os.environ.get(name, str(share)) for name in THREADS}
+        child_end, parent_end = multiprocessing.Pipe(duplex=False)
         try:
-            child_end, parent_end = multiprocessing.Pipe(duplex=False)
             with blocked_signals(SIGNALS), child_end:
                 pool = ProcessPoolExecutor(
                     1,
                     context=get_context("loky"),
                     initializer=prepare,
-                    initargs=(child_end, config),
-                    env={**ENVIRONMENT, **limits},
+                    initargs=(child_end, level),
+                    env=ENVIRONMENT,
                 )
-                process = _Process(config, pool, parent_end)
+                part = Part(number, self._count, self._is_small)
+                process = _Process(part, pool, parent_end)
                 self._call(process, [])
         except OSError as error:
-            raise RequestError(
-                f"--processes: {self._count}: no process can be started ({error.strerror}); ask "
-                "for fewer"
-            ) from None
-        self._processes[number] = process
+            if not self._processes:
+                raise RequestError(
+                    f"--processes: {self._count}: no process can be started ({error.strerror}); "
+                    "ask for fewer"
+                ) from None
+        else:
+            self._processes[number] = process
 
-    def _call(self, process: _Process, jobs: Sequence[Job], alone: bool = False) -> None:
-        """Give jobs to a process. Its report comes when it needs more."""
+    def _call(self, process: _Process, jobs: Sequence[Job]) -> None:
+        """Give jobs to a process. It reports when it needs more, or when it has done the last."""
         limit = len(jobs) if self._is_compiled and self._chunks.jobs else 0
         stamps = listed_stamps(path for job in jobs for path in job.paths)
-        future = process.pool.submit(run_chunk, self._spec, process.config, jobs, stamps, limit)
+        try:
+            call = process.pool.submit(run_chunk, self._spec, process.part, jobs, stamps, limit)
+        except BrokenExecutor as error:  # it has died since its last call
+            call = Future()
+            call.set_exception(error)
         process.held |= {job.stem: job for job in jobs}
-        process.is_busy = True
-        self._held[future] = process.held, alone
-        self._callers[future] = process
-        future.add_done_callback(self._finished.put)
+        process.call = call
+        self._held[call] = process.held
+        call.add_done_callback(self._finished.put)
 
     def _submit_chunks(self) -> bool:
         # The first process compiles the kernels and caches them for the others.
         processes = [*self._processes.values()]
+        least = (self._spec.execution.threads or available_processors() // self._count) + 3
         for process in processes if self._is_compiled else processes[:1]:
-            if process.is_busy:
+            if process.call in self._held:
                 continue
             jobs: list[Job] = []
-            alone = False
             if not self.is_stopping:
-                least = (self._spec.execution.threads or process.config.threads) + 3
                 jobs = self._chunks.cut(self._count, least if self._is_compiled else 1)
                 if not jobs and not process.held and self._chunks.suspects:
-                    jobs, alone = [self._chunks.suspects.popleft()], True
+                    jobs = [self._chunks.suspects.popleft()]
             if jobs or process.held:
-                self._call(process, jobs, alone)
+                self._call(process, jobs)
         return bool(self._held)
 
     def _result(self, future: Any, held: Mapping[str, Job]) -> ChunkReport:
-        process = self._callers.pop(future)
-        process.is_busy = False
+        process = next(each for each in self._processes.values() if each.call is future)
         try:
             report: ChunkReport = future.result()
         except Exception as error:  # of the pool, or a defect of clpipe
-            self._replace(process, _end_of(error))
-            raise WorkerDiedError(
-                f"killed the process that took it, 2 times; the last one {_end_of(error)}"
-            ) from error
+            end = _end_of(error)
+            self._replace(process, end)
+            reason = f"killed the process that took it, 2 times; the last one {end}"
+            raise WorkerDiedError(reason) from error
         process.is_ready = True
         self._is_compiled |= bool(report.outcomes)
-        self._deaths.pop(MADE if report.outcomes else OPENED, None)
+        del self._deaths[MADE if report.outcomes else OPENED]
         for outcome in report.outcomes:
             del process.held[outcome.job.stem]
         if not report.unfinished:
@@ -254,7 +236,7 @@ class Processes(ChunkExecutor):
             DeviceError: processes keep dying without doing anything.
             RequestError: no process is left, and none can be started.
         """
-        number = process.config.number
+        number = process.part.number
         del self._processes[number]
         process.close(kill=True)
         if self.is_stopping:
@@ -267,11 +249,7 @@ class Processes(ChunkExecutor):
                 f"--processes: {MAX_DEATHS[milestone]} processes in a row ended before they had "
                 f"{milestone}, the last one {end}; --processes 1 does without"
             )
-        try:
-            self._start(number)
-        except RequestError:
-            if not self._processes:
-                raise
+        self._start(number)
 
     def _halt(self) -> None:
         for process in self._processes.values():
@@ -284,32 +262,31 @@ def _start_trackers() -> None:
 
     They may not import modules from the working directory, and remove semaphores silently.
     """
-    before = {name: os.environ.get(name) for name in TRACKERS}
+    from loky.backend import resource_tracker as loky_tracker
+
+    before = {name: os.environ[name] for name in TRACKERS if name in os.environ}
     os.environ.update(TRACKERS)
     try:
-        for tracker in (loky_tracker, standard_tracker):
-            tracker.ensure_running()
+        loky_tracker.ensure_running()
+        standard_tracker.ensure_running()
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in TRACKERS:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _end_of(error: Exception) -> str:
     """Describe how a process ended, from the error of its call.
 
-    >>> from loky.process_executor import TerminatedWorkerError
-    >>> _end_of(TerminatedWorkerError("... exit codes of the workers are {SIGKILL(-9)}"))
+    >>> _end_of(RuntimeError("The exit codes of the workers are {SIGKILL(-9)}"))
     'by signal 9'
-    >>> _end_of(TerminatedWorkerError("... exit codes of the workers are {EXIT(1)}"))
+    >>> _end_of(RuntimeError("The exit codes of the workers are {EXIT(1)}"))
     'with status 1'
     >>> _end_of(KeyError("a"))
     "with KeyError: 'a'"
     """
-    match = re.search(r"\w\((-?\d+)\)", str(error))
-    if not isinstance(error, TerminatedWorkerError) or not match:
+    match = re.search(r"workers are \{\w+\((-?\d+)\)", str(error))
+    if not match:
         return f"with {type(error).__name__}: {error}"
     status = int(match[1])
     return f"by signal {-status}" if status < 0 else f"with status {status}"

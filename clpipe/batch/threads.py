@@ -102,7 +102,7 @@ class Batch:
         """
         return self._metering.jobs(jobs)
 
-    def run(self, jobs: Iterable[Job] | Jobs) -> Generator[Outcome, None, None]:
+    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, and yield outcomes as jobs finish, in any order. A batch runs once.
 
         Args:
@@ -118,9 +118,7 @@ class Batch:
         codecs = max(available_processors() // min(self.threads, count), 1)
         set_codec_threads(codecs)
         self.in_flight = min(self.in_flight, count)
-        if isinstance(jobs, queue.SimpleQueue):
-            self._jobs = jobs
-        elif isinstance(jobs, Sized):
+        if isinstance(jobs, Sized):
             self._queue(jobs)
         else:
             self._start("jobs", self._queue, jobs)
