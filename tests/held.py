@@ -46,6 +46,22 @@ def plant(code: str) -> None:
     processes.prepare = partial(_planted, code)  # type: ignore[assignment]
 
 
+def before(method: str, statement: str) -> str:
+    """Return code for :func:`plant` with a statement before each call of an ImageWorker's method.
+
+    The statement may use the method's arguments as ``given``.
+    """
+    return f"""
+import json, logging, os, pathlib, time
+from clpipe.base.errors import DeviceError
+from clpipe.batch.work import ImageWorker
+def planted(*given, real=ImageWorker.{method}):
+    {statement}
+    return real(*given)
+ImageWorker.{method} = planted
+"""
+
+
 def _planted(code: str, *arguments: Any) -> None:
     exec(code, {})
     local_worker.prepare(*arguments)

@@ -14,7 +14,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import resource_tracker as standard_tracker
@@ -145,8 +145,8 @@ class Processes(ChunkExecutor):
             yield from self._outcomes(all_jobs)
         finally:
             self._halt()
-            with ThreadPoolExecutor(self._count) as threads:
-                threads.map(_Process.close, self._processes.values())
+            for process in self._processes.values():
+                process.close()
             self._remove_unfinished(all_jobs)
 
     def _start(self, number: int) -> None:
