@@ -4,7 +4,6 @@ The process that starts such a run gives jobs to the workers in chunks, and gets
 chunk. If a worker dies, each of its jobs is tried once more, without any other job.
 """
 
-import logging
 import queue
 from abc import ABC, abstractmethod
 from collections import deque
@@ -30,14 +29,12 @@ class ChunkReport:
         seconds: the time since the worker got its last chunk.
         error: the error that ends the run, if any.
         unfinished: the number of jobs that the worker has begun. It reports them later.
-        records: the log records of the worker.
     """
 
     outcomes: Sequence[Outcome]
     seconds: float
     error: ClpipeError | None = None
     unfinished: int = 0
-    records: Sequence[logging.LogRecord] = ()
 
 
 class WorkerDiedError(Exception):
@@ -110,7 +107,6 @@ class ChunkExecutor(ABC):
         self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
         self._held: dict[Any, Mapping[str, Job]] = {}
         self._suspected: set[str] = set()  # the stems of jobs whose worker has died once
-        self._logged: set[str] = set()
 
     def stop(self) -> None:
         """Begin no more images, and finish those in flight. A signal handler may call it."""
@@ -167,10 +163,6 @@ class ChunkExecutor(ABC):
                 self._halt()
                 continue
             report = self._report(future)
-            for record in report.records:
-                if (text := record.getMessage()) not in self._logged:
-                    self._logged.add(text)  # every worker logs the same text
-                    logging.getLogger(record.name).handle(record)
             if report.outcomes:
                 self._chunks.took(report.seconds)
             yield from map(self._localized, report.outcomes)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from logging.handlers import QueueHandler
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
@@ -98,7 +98,6 @@ class _Worker:
 
 _workers: dict[int, _Worker] = {}  # one at most, by the number of this process
 _halted = threading.Event()
-_records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
 
 
 def _take_processors(number: int, count: int) -> int:
@@ -115,7 +114,8 @@ def prepare(connection: Connection, level: int) -> None:
     """Prepare this process for a run.
 
     Args:
-        connection: gets a message if the run stops, and is closed when the run's process ends.
+        connection: gets log records, and gives a message if the run stops. The other end is closed
+            when the run's process ends.
         level: the lowest level that is logged.
     """
     os.dup2(2, 1)  # libraries may print; stdout is for the run's own output
@@ -124,7 +124,18 @@ def prepare(connection: Connection, level: int) -> None:
     gc.freeze()  # imported modules remain in use, so the collector need not visit them
     logger = logging.getLogger("clpipe")
     logger.setLevel(level)
-    logger.addHandler(QueueHandler(_records))
+    logger.addHandler(_Forwarder(connection))  # type: ignore[arg-type]
+
+
+class _Forwarder(QueueHandler):
+    """Sends log records over a connection."""
+
+    queue: Any
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Send a record, unless the run's process has ended."""
+        with suppress(OSError):
+            self.queue.send(record)
 
 
 def _finish() -> NoReturn:
@@ -185,5 +196,4 @@ def run_chunk(
         unfinished = worker.unfinished
     except ClpipeError as problem:
         error = problem
-    records = [_records.get() for _ in range(_records.qsize())]
-    return ChunkReport(outcomes, time.perf_counter() - start, error, unfinished, records)
+    return ChunkReport(outcomes, time.perf_counter() - start, error, unfinished)

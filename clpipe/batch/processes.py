@@ -12,6 +12,7 @@ import logging
 import multiprocessing
 import os
 import re
+import threading
 from collections import Counter
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
@@ -90,7 +91,9 @@ class _Process:
     Args:
         part: its part of the run.
         pool: calls functions in it.
-        connection: gets a message to stop the process; the process ends if it is closed.
+        connection: gives log records, and gets a message to stop the process. If it is closed, the
+            process ends.
+        listener: the thread that receives the log records.
         held: its jobs without an outcome, by stem.
         call: the last call.
         is_ready: whether it has opened its devices.
@@ -99,6 +102,7 @@ class _Process:
     part: Part
     pool: Any
     connection: Connection
+    listener: threading.Thread
     held: dict[str, Job] = field(default_factory=dict)
     call: Any = None
     is_ready: bool = False
@@ -106,6 +110,7 @@ class _Process:
     def close(self, kill: bool = False) -> None:
         """End it when it has done its jobs, or at once, and wait for its end."""
         self.pool.shutdown(kill_workers=kill)
+        self.listener.join()
         self.connection.close()
 
 
@@ -120,6 +125,7 @@ class Processes(ChunkExecutor):
 
     def __init__(self, spec: RunSpec, count: int, claim: MemoryClaim) -> None:
         super().__init__(spec, SHORT_CHUNK, LONG_CHUNK)
+        self._chunks.size = 1  # the other processes wait for the first one
         self._count = count
         self._is_small = claim.megapixels <= SMALL_MEGAPIXELS
         self._processes: dict[int, _Process] = {}
@@ -127,6 +133,7 @@ class Processes(ChunkExecutor):
         self._is_compiled = False
         # Deaths of processes in a row that had not reached a milestone.
         self._deaths: Counter[str] = Counter()
+        self._logged: set[str] = set()
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, and yield outcomes as jobs finish, in any order.
@@ -159,19 +166,21 @@ class Processes(ChunkExecutor):
         from loky.backend import get_context
 
         level = logging.getLogger("clpipe").getEffectiveLevel()
-        child_end, parent_end = multiprocessing.Pipe(duplex=False)
+        ours, theirs = multiprocessing.Pipe()
         try:
-            with blocked_signals(SIGNALS), child_end:
+            with blocked_signals(SIGNALS), theirs:
                 pool = ProcessPoolExecutor(
                     1,
                     context=get_context("loky"),
                     initializer=prepare,
-                    initargs=(child_end, level),
+                    initargs=(theirs, level),
                     env=ENVIRONMENT,
                 )
                 part = Part(number, self._count, self._is_small)
-                process = _Process(part, pool, parent_end)
+                listener = threading.Thread(target=self._log, args=(ours,), daemon=True)
+                process = _Process(part, pool, ours, listener)
                 self._call(process, [])
+                listener.start()
         except OSError as error:
             if not self._processes:
                 raise RequestError(
@@ -180,6 +189,15 @@ class Processes(ChunkExecutor):
                 ) from None
         else:
             self._processes[number] = process
+
+    def _log(self, connection: Connection) -> None:
+        """Log what a process logs until it ends. Each text appears once."""
+        with suppress(EOFError, OSError):
+            while True:
+                record = connection.recv()
+                if (text := record.getMessage()) not in self._logged:
+                    self._logged.add(text)
+                    logging.getLogger(record.name).handle(record)
 
     def _call(self, process: _Process, jobs: Sequence[Job]) -> None:
         """Give jobs to a process. It reports when it needs more, or when it has done the last."""
