@@ -14,8 +14,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from clpipe.batch import local_worker, processes
 from tests.conftest import ROOT
 
 GUARD = 300.0  # s; a wait that reaches it has failed, however busy the machine is
@@ -34,11 +37,34 @@ def held(self, job, *arguments):
 ImageWorker.begin = held
 """
 # In the processes that a run starts, not in the run's own process.
-HOLDING_PROCESSES = f"""
-from clpipe.batch import processes
-processes.START = "exec(" + repr({HOLDING!r}) + "); " + processes.START
-"""
+HOLDING_PROCESSES = f"from tests.held import plant; plant({HOLDING!r})"
 PROGRAM = "exec({planted!r}); from clpipe.__main__ import main; main()"
+
+
+def plant(code: str) -> None:
+    """Let each process that a run starts execute some code first."""
+    processes.prepare = partial(_planted, code)  # type: ignore[assignment]
+
+
+def before(method: str, statement: str) -> str:
+    """Return code for :func:`plant` with a statement before each call of an ImageWorker's method.
+
+    The statement may use the method's arguments as ``given``.
+    """
+    return f"""
+import json, logging, os, pathlib, time
+from clpipe.base.errors import DeviceError
+from clpipe.batch.work import ImageWorker
+def planted(*given, real=ImageWorker.{method}):
+    {statement}
+    return real(*given)
+ImageWorker.{method} = planted
+"""
+
+
+def _planted(code: str, *arguments: Any) -> None:
+    exec(code, {})
+    local_worker.prepare(*arguments)
 
 
 def start(

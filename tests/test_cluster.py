@@ -33,7 +33,7 @@ from clpipe.engine.discovery import devices_of_process
 from clpipe.engine.hardware import Hardware
 from clpipe.inputs.find import Job
 from tests.conftest import ROOT
-from tests.held import GUARD
+from tests.held import GUARD, before
 
 IMAGES = 16
 
@@ -108,14 +108,9 @@ class DieOf(WorkerPlugin):
         self.name = name
 
     def setup(self, worker):
-        decode = work.ImageWorker.begin
-
-        def planted(this, job, *arguments):
-            if job.path.name == self.name:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return decode(this, job, *arguments)
-
-        work.ImageWorker.begin = planted
+        exec(
+            before("begin", f"given[1].path.name == {self.name!r} and os.kill(os.getpid(), 9)"), {}
+        )
 
 
 @pytest.mark.slow

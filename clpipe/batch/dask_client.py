@@ -9,18 +9,16 @@ reports it as skipped.
 import asyncio
 import contextlib
 import logging
-import queue
 import time
-from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from clpipe.base.about import __version__
-from clpipe.base.errors import ClpipeError, ClusterError, RequestError
+from clpipe.base.errors import ClusterError, RequestError
 from clpipe.base.extras import require
+from clpipe.batch.chunks import ChunkExecutor, ChunkReport, WorkerDiedError
 from clpipe.batch.dask_worker import (
-    ChunkReport,
     DaskSpec,
     WorkerEnvironment,
     as_written,
@@ -31,11 +29,10 @@ from clpipe.batch.dask_worker import (
     probe_worker,
     run_chunk,
 )
-from clpipe.batch.outcome import FAILED, Outcome
+from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import shifted
 from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
-from clpipe.outputs.folder import remove_unfinished
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +44,6 @@ FIRST_TIMEOUT, WORKER_TIMEOUT = 3600.0, 600.0
 NOTE_SECONDS = 5.0  # s; a longer wait for a worker is announced
 
 RETRIES = 2  # retries of a chunk that ended with an unexpected error
-
-FIRST_CHUNK, MAX_CHUNK = 4, 64  # number of images in a chunk
 
 # s; chunks grow after one that took less time, and shrink after one that took more.
 SHORT_CHUNK, LONG_CHUNK = (
@@ -99,23 +94,16 @@ async def _reach(address: str) -> None:
     await comm.close()
 
 
-class Cluster:
+class Cluster(ChunkExecutor):
     """The workers of a cluster; an :class:`~clpipe.batch.sinks.Executor`."""
 
+    _spec: DaskSpec
+
     def __init__(self, client: Any, address: str, spec: DaskSpec) -> None:
+        super().__init__(spec.with_absolute_paths(), SHORT_CHUNK, LONG_CHUNK)
         self._client = client
         self._address = address
-        self._spec = spec.with_absolute_paths()
-        self.is_stopping = False
-        self._finished: queue.SimpleQueue[Any] = queue.SimpleQueue()  # futures; None means stop
-        # Jobs of each chunk, and whether the chunk runs alone.
-        self._running: dict[Any, tuple[list[Job], bool]] = {}
         self._last_worker_time = time.monotonic()  # the last time at which there was a worker
-
-    def stop(self) -> None:
-        """Begin no more images, and finish those in flight. A signal handler may call it."""
-        self.is_stopping = True
-        self._finished.put(None)
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, and yield outcomes as chunks finish, in any order.
@@ -131,7 +119,11 @@ class Cluster:
         if not self._wait_for_worker():
             return
         self._probe(with_absolute_paths)
-        yield from self._outcomes(with_absolute_paths)
+        try:
+            yield from self._outcomes(with_absolute_paths)
+        except GeneratorExit:
+            self._finish()
+            raise
 
     def _wait_for_worker(self) -> bool:
         """Wait until a worker has done a task. Adaptive clusters start workers only for tasks.
@@ -191,45 +183,10 @@ class Cluster:
         check_same_environment(environments)
         self._spec = replace(spec, environment=next(iter(environments.values())))
 
-    def _outcomes(self, jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
-        chunks = _Chunks(deque(jobs))
-        failure: ClpipeError | None = None
-        try:
-            while self._running or (chunks and not self.is_stopping):
-                has_workers = self._submit_chunks(chunks)
-                if self.is_stopping and not has_workers:
-                    break  # the other chunks wait for workers
-                try:
-                    future = self._finished.get(timeout=1)
-                except queue.Empty:
-                    continue
-                if future is None:
-                    self._halt()
-                    continue
-                report = self._report(future, chunks)
-                chunks.took(report.seconds)
-                clock_offset = time.perf_counter() - time.time()
-                for outcome in report.outcomes:
-                    yield shifted(outcome, clock_offset)
-                if report.error:
-                    failure = failure or report.error
-                    self._halt()
-        except GeneratorExit:
-            self._finish()
-            raise
-        patches = self._spec.request.patch is not None
-        # Removes files of workers that died.
-        remove_unfinished(self._spec.execution.output, jobs, patches)
-        if failure:
-            raise failure
-
-    def _submit_chunks(self, chunks: "_Chunks") -> bool:
+    def _submit_chunks(self) -> bool:
         """Submit one chunk more than workers have threads, so that adaptive clusters grow.
 
         Dask chooses the worker. A chunk that is bound to one would wait for ever if it dies.
-
-        Returns:
-            Whether there are workers.
 
         Raises:
             ClusterError: there has been no worker for long, or the scheduler is gone.
@@ -247,45 +204,38 @@ class Cluster:
                 f"--dask: the scheduler at {self._address} has had no workers for "
                 f"{WORKER_TIMEOUT:g} s; finished pictures are kept, and the same command resumes"
             )
-        while chunks.jobs and len(self._running) <= threads and not self.is_stopping:
-            self._submit(chunks.cut(threads + 1))
-        if chunks.suspects and not self._running and not self.is_stopping:
-            self._submit([chunks.suspects.popleft()], alone=True)
-        return bool(workers)
+        if self.is_stopping:
+            return bool(self._held and workers)  # without workers, the other chunks wait for some
+        while self._chunks.jobs and len(self._held) <= threads:
+            self._submit(self._chunks.cut(threads + 1))
+        if self._chunks.suspects and not self._held:
+            self._submit([self._chunks.suspects.popleft()])
+        return bool(self._held)
 
-    def _submit(self, chunk: list[Job], alone: bool = False) -> None:
+    def _submit(self, chunk: list[Job]) -> None:
         future = self._client.submit(run_chunk, self._spec, chunk, pure=False, retries=RETRIES)
-        self._running[future] = (chunk, alone)
+        self._held[future] = {job.stem: job for job in chunk}
         future.add_done_callback(self._finished.put)
 
-    def _report(self, future: Any, chunks: "_Chunks") -> ChunkReport:
-        """Return the report of a finished chunk.
-
-        Raises:
-            ClusterError: the scheduler is gone.
-        """
+    def _result(self, future: Any, held: Mapping[str, Job]) -> ChunkReport:
         from distributed import KilledWorker
 
-        chunk, alone = self._running.pop(future)
         try:
             return future.result()
         except KilledWorker as error:
-            if not alone:
-                # Another chunk on these workers may have caused the deaths.
-                chunks.suspects += chunk
-                return ChunkReport((), LONG_CHUNK)
             deaths = f"{error.allowed_failures + 1} in all, the last one {_worker_name(error)}"
-            return _failed(chunk, f"killed the worker that took it, {deaths}")
+            raise WorkerDiedError(f"killed the worker that took it, {deaths}") from None
         except Exception as error:
             if future.status in ("cancelled", "lost"):
                 raise self._lost_cluster() from None
-            return _failed(chunk, f"on a worker: {type(error).__name__}: {error}")
+            return self._failed(held, f"on a worker: {type(error).__name__}: {error}")
         finally:
             future.release()  # otherwise Dask recomputes the result if its worker dies
 
+    def _localized(self, outcome: Outcome) -> Outcome:
+        return shifted(as_written(outcome), time.perf_counter() - time.time())
+
     def _halt(self) -> None:
-        """Let the workers finish the images in flight, and begin no others."""
-        self.is_stopping = True
         self._client.run(halt, self._spec.run, on_error="ignore")
 
     def _finish(self) -> None:
@@ -294,55 +244,13 @@ class Cluster:
 
         self._halt()
         with self._client.as_current(), contextlib.suppress(TimeoutError):
-            wait(list(self._running), timeout=LONG_CHUNK)
+            wait(list(self._held), timeout=LONG_CHUNK)
 
     def _lost_cluster(self) -> ClusterError:
         return ClusterError(
             f"--dask: the scheduler at {self._address} or its workers have gone; "
             "finished pictures are kept, and the same command resumes"
         )
-
-
-@dataclass
-class _Chunks:
-    """The jobs that are left, to be cut into chunks.
-
-    Chunks grow while they take little time, and get smaller towards the end. ``suspects`` are jobs
-    whose workers died. Each is tried alone at the end.
-
-    >>> from pathlib import Path
-    >>> chunks = _Chunks(deque(Job(Path(str(i)), "") for i in range(100)))
-    >>> chunks.took(1.0)
-    >>> [len(chunks.cut(2)) for _ in range(4)], len(chunks.jobs)
-    ([8, 8, 8, 8], 68)
-    >>> chunks.took(100.0)
-    >>> len(chunks.cut(2)), len(chunks.cut(20))
-    (4, 1)
-    """
-
-    jobs: deque[Job]
-    suspects: deque[Job] = field(default_factory=deque)
-    size: int = FIRST_CHUNK
-
-    def __bool__(self) -> bool:
-        return bool(self.jobs or self.suspects)
-
-    def cut(self, count: int) -> list[Job]:
-        """Return the next chunk, if a number of chunks run or wait at a time."""
-        size = max(1, min(self.size, len(self.jobs) // (2 * count)))
-        return [self.jobs.popleft() for _ in range(size)]
-
-    def took(self, seconds: float) -> None:
-        """Adapt the size of chunks to the seconds that one took."""
-        if seconds < SHORT_CHUNK:
-            self.size = min(2 * self.size, MAX_CHUNK)
-        elif seconds > LONG_CHUNK:
-            self.size = max(self.size // 2, 1)
-
-
-def _failed(chunk: Sequence[Job], reason: str) -> ChunkReport:
-    failed = (Outcome(job, FAILED, error=f"{job.path}: {reason}") for job in chunk)
-    return ChunkReport(list(map(as_written, failed)), LONG_CHUNK)
 
 
 def _worker_name(error: Any) -> str:

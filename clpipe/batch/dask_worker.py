@@ -17,6 +17,7 @@ import numpy as np
 from clpipe.base.about import __version__
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ClpipeError, RequestError
+from clpipe.batch.chunks import ChunkReport
 from clpipe.batch.outcome import Outcome
 from clpipe.batch.spec import RunSpec, shifted
 from clpipe.batch.threads import Batch
@@ -84,15 +85,6 @@ class WorkerEnvironment:
     program: str
     device: str
     libraries: str
-
-
-@dataclass(frozen=True)
-class ChunkReport:
-    """The outcomes of a chunk, its seconds, and the error that ends the run, if any."""
-
-    outcomes: Sequence[Outcome]
-    seconds: float
-    error: ClpipeError | None = None
 
 
 _one_chunk = threading.Lock()  # lets one chunk at a time use this worker's devices
@@ -209,7 +201,7 @@ def run_chunk(spec: DaskSpec, jobs: Sequence[Job]) -> ChunkReport:
                 batch.stop()
             clock_offset = time.time() - time.perf_counter()
             for outcome in batch.run(jobs):
-                outcomes.append(shifted(as_written(outcome), clock_offset, f"{worker.address} "))
+                outcomes.append(shifted(outcome, clock_offset, f"{worker.address} "))
                 if is_abandoned():  # the process that started the run has abandoned it
                     batch.stop()
         except ClpipeError as problem:

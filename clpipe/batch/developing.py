@@ -28,7 +28,6 @@ class Developing:
         devices: the devices; None is NumPy.
         threads: the number of renditions that are encoded at a time.
         budget: notified when a device has compiled its kernels.
-        compiled: called at the same time.
         fail: called with an error after which the run cannot continue.
 
     Attributes:
@@ -42,14 +41,12 @@ class Developing:
         devices: Sequence[Device | None],
         threads: int,
         budget: MemoryBudget,
-        compiled: Callable[[], None],
         fail: Callable[[BaseException], None],
     ) -> None:
         self.service = Service(devices, self._prepare)
         self.max_in_flight = threads + len(devices)
         self._worker = worker
         self._budget = budget
-        self._on_compiled = compiled
         self._fail = fail
         self._encoders = ThreadPoolExecutor(threads, "encode")
         self._error: BaseException | None = None  # why no device can be used
@@ -63,7 +60,6 @@ class Developing:
         """
         try:
             self._worker.compile(device)
-            self._on_compiled()
         except DeviceError:
             raise
         except BaseException as error:

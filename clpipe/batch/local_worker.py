@@ -1,8 +1,8 @@
-"""The main function of a process that does a part of a run on this machine.
+"""The functions that a process of a run on this machine calls for :class:`Processes`.
 
-It receives jobs from :class:`clpipe.batch.processes.Processes` over a connection, and sends
-outcomes back. It ends when there are no more jobs, and immediately if the run's process has ended.
-It ignores signals, because the run's process tells it when to stop.
+The process keeps its devices open, and a :class:`clpipe.batch.threads.Batch` that works without a
+pause: a call returns while the jobs that came with it are still being done. The process ignores
+signals, because the run's process tells it when to stop. It ends if the run's process has ended.
 """
 
 import gc
@@ -11,62 +11,137 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from logging.handlers import QueueHandler
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from typing import Any, NoReturn
 
 from clpipe.base.errors import ClpipeError
 from clpipe.base.files import discard, remove_temporary_files
 from clpipe.base.process_folder import process_folder
-from clpipe.base.system import bind_to_processors
+from clpipe.base.processors import available_processors
+from clpipe.base.system import bind_to_processors, processor_numbers
 from clpipe.base.transfers import TRANSFERS
-from clpipe.base.urls import remember_stamps
-from clpipe.batch.downloads import Jobs
+from clpipe.base.urls import Stamp, remember_stamps
+from clpipe.batch.chunks import ChunkReport
 from clpipe.batch.outcome import Outcome
-from clpipe.batch.spec import RunSpec
-from clpipe.batch.threads import Batch
+from clpipe.batch.spec import RunSpec, shifted
 from clpipe.engine.device import Device, open_devices
+from clpipe.inputs.find import Job
 
-COLLECT_SECONDS = 0.005  # s; outcomes of this time are sent in one message
+# The names up to PoCL 3.1, and since PoCL 4.
+THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
 
 @dataclass(frozen=True)
-class ProcessConfig:
+class Part:
     """One process's part of a run.
 
     Args:
         number: its number, from 0.
         count: the number of processes.
-        threads: the number of threads if the run does not set it.
-        processors: the processors that it is bound to. () binds it to none.
-        sequential: whether a single thread makes the images, see :mod:`clpipe.batch.threads`.
-        level: the lowest level that is logged.
+        is_small: whether a single thread makes the images if there is one processor, see
+            :mod:`clpipe.batch.threads`.
     """
 
     number: int
     count: int
-    threads: int
-    processors: tuple[int, ...] = ()
-    sequential: bool = False
-    level: int = logging.INFO
+    is_small: bool
 
 
-def main(file: int) -> None:
-    """Work for the run at the other end of a connection, given by its file descriptor."""
-    pipe = _PipeToRun(Connection(file))
+class _Worker:
+    """The devices and the batch of this process.
+
+    Args:
+        spec: the run.
+        part: this process's part of it.
+
+    Raises:
+        DeviceError: there is no usable device.
+    """
+
+    def __init__(self, spec: RunSpec, part: Part) -> None:
+        processors = _take_processors(part.number, part.count)
+        for name in THREADS:
+            os.environ.setdefault(name, str(processors))
+        execution, share = spec.execution, (part.number, part.count)
+        devices: list[Device | None] = [*open_devices(execution.devices, execution.memory, share)]
+        in_flight = 1 if processors == 1 and part.is_small and len(devices) <= 1 else None
+        self.batch = spec.batch(devices or [None], processors, part.count, in_flight)
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._outcomes = self.batch.run(iter(self._jobs.get, None))
+        self.unfinished = 0  # jobs that will have an outcome
+
+    def outcomes(self, jobs: Collection[Job], limit: int) -> Iterator[Outcome]:
+        """Begin jobs, and yield outcomes until ``limit`` jobs are unfinished or the batch ends."""
+        for job in jobs:
+            self._jobs.put(job)
+        self.unfinished += len(jobs)
+        while self.unfinished > limit:
+            outcome = next(self._outcomes, None)
+            if not outcome:
+                self.unfinished = 0
+                break
+            self.unfinished -= 1
+            yield outcome
+
+    def finish(self) -> None:
+        """Finish the images in flight, and end all threads."""
+        self._jobs.put(None)
+        with suppress(ClpipeError):
+            for _ in self._outcomes:
+                pass
+
+
+_workers: dict[int, _Worker] = {}  # one at most, by the number of this process
+_halted = threading.Event()
+
+
+def _take_processors(number: int, count: int) -> int:
+    """Bind this process to its part of the processors, if it has some, and return their number."""
+    numbers, available = processor_numbers(), available_processors()
+    if not len(numbers) == available >= count:
+        return max(available // count, 1)
+    own = numbers[number * available // count : (number + 1) * available // count]
+    bind_to_processors(own)
+    return len(own)
+
+
+def prepare(connection: Connection, level: int) -> None:
+    """Prepare this process for a run.
+
+    Args:
+        connection: gets log records, and gives a message if the run stops. The other end is closed
+            when the run's process ends.
+        level: the lowest level that is logged.
+    """
+    os.dup2(2, 1)  # libraries may print; stdout is for the run's own output
+    threading.Thread(target=_watch, args=(connection,), daemon=True).start()
+    Finalize(None, _finish, exitpriority=0)
     gc.freeze()  # imported modules remain in use, so the collector need not visit them
-    spec, config = pipe.receive()
-    if config.processors:
-        bind_to_processors(config.processors)
     logger = logging.getLogger("clpipe")
-    logger.setLevel(config.level)
-    logger.addHandler(_Forwarder(pipe))
-    try:
-        _work(pipe, spec, config)
-    except ClpipeError as error:
-        pipe.send("failed", error)
-    pipe.send("end")
+    logger.setLevel(level)
+    logger.addHandler(_Forwarder(connection))  # type: ignore[arg-type]
+
+
+class _Forwarder(QueueHandler):
+    """Sends log records over a connection."""
+
+    queue: Any
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Send a record, unless the run's process has ended."""
+        with suppress(OSError):
+            self.queue.send(record)
+
+
+def _finish() -> NoReturn:
+    """Finish the images in flight, and end this process."""
+    for worker in _workers.values():
+        worker.finish()
     _leave(0)
 
 
@@ -77,103 +152,48 @@ def _leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-class _PipeToRun:
-    """The connection to the run's process. Ends this process silently when that one has ended."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._sending = threading.Lock()  # lets one thread send at a time
-
-    def send(self, *message: Any) -> None:
-        """Send values. Any thread may call it."""
-        try:
-            with self._sending:
-                self._connection.send(message)
-        except OSError:
-            _exit_at_once()
-
-    def receive(self) -> Any:
-        """Return the next message. Only one thread may call it at a time."""
-        try:
-            return self._connection.recv()
-        except (EOFError, OSError):
-            _exit_at_once()
-
-
-def _exit_at_once() -> NoReturn:
-    """End this process without finishing its images."""
+def _watch(connection: Connection) -> None:
+    """Stop when the run does, and end this process at once when the run's process has ended."""
+    with suppress(EOFError, OSError):
+        while True:
+            connection.recv_bytes()
+            _halted.set()
+            TRANSFERS.stop()
+            for worker in [*_workers.values()]:
+                worker.batch.stop()
     remove_temporary_files()
     _leave(1)
 
 
-def _work(pipe: _PipeToRun, spec: RunSpec, config: ProcessConfig) -> None:
-    """Do the jobs that arrive, and send their outcomes.
+def run_chunk(
+    spec: RunSpec,
+    part: Part,
+    jobs: Collection[Job],
+    stamps: Mapping[str, Stamp],
+    limit: int,
+) -> ChunkReport:
+    """Begin jobs, and report outcomes as soon as at most ``limit`` jobs are unfinished.
 
-    Raises:
-        ClpipeError: the process cannot continue.
+    Args:
+        spec: the run.
+        part: this process's part of it.
+        jobs: the jobs.
+        stamps: known stamps of their URLs.
+        limit: the number of jobs that may be unfinished.
     """
-    execution = spec.execution
-    share = config.number, config.count
-    devices: list[Device | None] = [*open_devices(execution.devices, execution.memory, share)] or [
-        None
-    ]
-    pipe.send("ready")
-    jobs: Jobs = queue.SimpleQueue()
-    in_flight = 1 if config.sequential and len(devices) == 1 else None
-    batch = spec.batch(
-        devices, config.threads, config.count, in_flight, compiled=lambda: pipe.send("compiled")
-    )
-    threading.Thread(target=_listen, args=(pipe, jobs, batch), daemon=True).start()
-    finished: queue.SimpleQueue[Outcome | None] = queue.SimpleQueue()
-    sender = threading.Thread(target=_send_outcomes, args=(pipe, finished))
-    sender.start()
+    start = time.perf_counter()
+    remember_stamps(stamps)
+    outcomes: list[Outcome] = []
+    error, unfinished = None, 0
     try:
-        for outcome in batch.run(jobs):
-            finished.put(outcome)
-    finally:
-        finished.put(None)
-        sender.join()
-
-
-def _listen(pipe: _PipeToRun, jobs: Jobs, batch: Batch) -> None:
-    """Receive jobs until the end or a stop."""
-    while True:
-        kind, *values = pipe.receive()
-        if kind == "jobs":
-            remember_stamps(values[1])
-            for job in values[0]:
-                jobs.put(job)
-        if kind == "stop":
-            TRANSFERS.stop()
-            batch.stop()
-        if kind != "jobs":
-            jobs.put(None)
-
-
-def _send_outcomes(pipe: _PipeToRun, finished: "queue.SimpleQueue[Outcome | None]") -> None:
-    """Send outcomes, several in each message."""
-    for first in iter(finished.get, None):
-        time.sleep(COLLECT_SECONDS)
-        outcomes = [first, *_waiting(finished)]
-        pipe.send("outcomes", [each for each in outcomes if each])
-        if None in outcomes:
-            return
-
-
-def _waiting(finished: "queue.SimpleQueue[Outcome | None]") -> Iterator[Outcome | None]:
-    while True:
-        try:
-            yield finished.get_nowait()
-        except queue.Empty:
-            return
-
-
-class _Forwarder(logging.Handler):
-    """Sends log records to the run's process, which prints them."""
-
-    def __init__(self, pipe: _PipeToRun) -> None:
-        super().__init__()
-        self._pipe = pipe
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._pipe.send("log", record.levelno, record.getMessage())
+        if not _workers:
+            _workers[part.number] = _Worker(spec, part)
+        worker = _workers[part.number]
+        if _halted.is_set():
+            worker.batch.stop()
+        for outcome in worker.outcomes(jobs, limit):
+            outcomes.append(shifted(outcome, 0.0, f"{part.number} "))
+        unfinished = worker.unfinished
+    except ClpipeError as problem:
+        error = problem
+    return ChunkReport(outcomes, time.perf_counter() - start, error, unfinished)

@@ -3,36 +3,37 @@
 One Python process computes at most a few hundred small images per second on any number of
 processors, because its threads share the interpreter's lock. A run therefore has several processes
 if they save time. This process holds the output directory and the log, distributes jobs, and
-collects outcomes. Each of the others runs a :class:`clpipe.batch.threads.Batch`. If one dies, the
-others get its jobs. Sidecars show which of these are finished.
+collects outcomes. Each of the others runs a :class:`clpipe.batch.threads.Batch`, and is the only
+worker of a pool of Loky. Unlike the pools of the standard library, these do not import the script
+that starts the run. If a process dies, others get its jobs. Sidecars show which are finished.
 """
 
-import contextlib
-import json
 import logging
 import multiprocessing
 import os
-import queue
-import subprocess
-import sys
+import re
 import threading
-from collections import Counter, deque
-from collections.abc import Generator, Iterable, Sequence
+from collections import Counter
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker as standard_tracker
 from multiprocessing.connection import Connection
+from typing import Any
 
-from clpipe.base.errors import ClpipeError, DeviceError, RequestError
+from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.memory import available_memory
 from clpipe.base.processors import available_processors
-from clpipe.base.system import blocked_signals, processor_numbers
+from clpipe.base.system import blocked_signals
 from clpipe.base.urls import listed_stamps
+from clpipe.batch.chunks import ChunkExecutor, ChunkReport, WorkerDiedError
 from clpipe.batch.interrupt import SIGNALS
-from clpipe.batch.local_worker import ProcessConfig
-from clpipe.batch.outcome import FAILED, Outcome
-from clpipe.batch.spec import RunSpec, shifted
+from clpipe.batch.local_worker import Part, prepare, run_chunk
+from clpipe.batch.outcome import Outcome
+from clpipe.batch.spec import RunSpec
 from clpipe.images.claims import MemoryClaim
 from clpipe.inputs.find import Job
-from clpipe.outputs.folder import remove_unfinished
 
 log = logging.getLogger(__name__)
 
@@ -46,23 +47,15 @@ MIN_WORK_MS = 1200  # ms; work that justifies a process. Starting a process take
 SMALL_MEGAPIXELS = 2.5  # megapixels; up to this size, reading and developing need not overlap
 PROCESS_MEMORY = 400 << 20  # bytes per process
 
-# The most jobs that a process holds, usually and near the end of the run.
-MAX_QUEUED, MIN_QUEUED = 64, 12
-# After this many deaths of processes, their job fails. If they die while starting, the run fails.
-MAX_DEATHS = 3
-MAX_FRUITLESS = 20  # the run fails after this many deaths in a row without an outcome
+SHORT_CHUNK, LONG_CHUNK = 0.5, 2.0  # s; chunks grow and shrink at these times
 
-PROGRAM = (
-    "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-    "signal.signal(signal.SIGTERM, signal.SIG_IGN); "
-    "import json, sys; sys.path[:] = json.loads({path!r}); {start}"
-)
-START = "from clpipe.batch.local_worker import main; main(int(sys.argv[1]))"
-# The name up to PoCL 3.1, and the name since PoCL 4.
-THREADS = (
-    "POCL_MAX_PTHREAD_COUNT",
-    "POCL_CPU_MAX_CU_COUNT",
-)
+# The run fails after so many deaths of processes in a row that have not reached a milestone.
+OPENED, MADE = "opened a device", "made an image"
+MAX_DEATHS = {OPENED: 3, MADE: 20}
+
+# Python imports no modules from the working directory, and Loky restarts no large process.
+ENVIRONMENT = {"PYTHONSAFEPATH": "1", "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
+TRACKERS = {"PYTHONSAFEPATH": "1", "PYTHONWARNINGS": "ignore"}
 
 
 def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
@@ -86,32 +79,53 @@ def default_processes(images: int, claim: MemoryClaim, processors: int) -> int:
         if claim.megapixels <= SMALL_MEGAPIXELS
         else max(image_ms / LOCKED_MS * MAX_LOCK_SHARE, 1.0)
     )
+    if not _has_semaphores():
+        return 1
     free = available_memory()
     fit = processors if free is None else free // PROCESS_MEMORY
     return max(min(int(processors / busy), int(images * image_ms / MIN_WORK_MS), fit), 1)
 
 
+def _has_semaphores() -> bool:
+    """Return whether the system has the semaphores of pools. Some containers lack /dev/shm."""
+    try:
+        multiprocessing.get_context("spawn").Semaphore()
+    except OSError:
+        return False
+    return True
+
+
 @dataclass
 class _Process:
-    """The parent's view of one process."""
+    """A process of the run: a pool with one worker, so its death breaks only this pool.
 
-    config: ProcessConfig
-    popen: "subprocess.Popen[bytes]"
+    Args:
+        part: its part of the run.
+        pool: calls functions in it.
+        connection: gives log records, and gets a message to stop the process. If it is closed, the
+            process ends.
+        listener: the thread that receives the log records.
+        held: its jobs without an outcome, by stem.
+        call: the last call.
+        is_ready: whether it has opened its devices.
+    """
+
+    part: Part
+    pool: Any
     connection: Connection
-    listener: threading.Thread = field(default_factory=threading.Thread)
-    jobs: dict[str, Job] = field(default_factory=dict)  # jobs of the process, by stem
-    is_alone: bool = False  # whether the process is testing one suspect job
-    is_ready: bool = False  # whether the process has opened its devices
+    listener: threading.Thread
+    held: dict[str, Job] = field(default_factory=dict)
+    call: Any = None
+    is_ready: bool = False
 
-    def close(self) -> int:
-        """Wait for its end, and return its exit status."""
-        status = self.popen.wait()
+    def close(self, kill: bool = False) -> None:
+        """End it when it has done its jobs, or at once, and wait for its end."""
+        self.pool.shutdown(kill_workers=kill)
         self.listener.join()
         self.connection.close()
-        return status
 
 
-class Processes:
+class Processes(ChunkExecutor):
     """The processes of a run; an :class:`~clpipe.batch.sinks.Executor`.
 
     Args:
@@ -121,247 +135,187 @@ class Processes:
     """
 
     def __init__(self, spec: RunSpec, count: int, claim: MemoryClaim) -> None:
-        self._spec = spec
+        super().__init__(spec, SHORT_CHUNK, LONG_CHUNK)
+        self._chunks.size = 1  # the other processes wait for the first one
         self._count = count
         self._is_small = claim.megapixels <= SMALL_MEGAPIXELS
-        self._messages: queue.SimpleQueue[tuple[_Process | None, tuple[object, ...]]]
-        self._messages = queue.SimpleQueue()
-        self._processes: list[_Process] = []
-        self._remaining: deque[Job] = deque()
-        # Jobs of processes that died; each is tried separately at the end.
-        self._suspects: deque[Job] = deque()
-        # For each job's stem, the deaths of processes that held the job.
-        self._deaths: Counter[str] = Counter()
+        self._processes: dict[int, _Process] = {}
         # Whether a process has compiled the kernels, which are then cached.
         self._is_compiled = False
-        self._early_deaths = 0  # processes in a row that died before they were ready
-        self._fruitless_deaths = 0  # processes that died since the last outcome
+        # Deaths of processes in a row that had not reached a milestone.
+        self._deaths: Counter[str] = Counter()
         self._logged: set[str] = set()
-        self._failure: ClpipeError | None = None
-        self.is_stopping = False
-
-    def stop(self) -> None:
-        """Begin no more images, and finish those in flight. A signal handler may call it."""
-        self.is_stopping = True
-        self._messages.put((None, ("stop",)))
 
     def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, and yield outcomes as jobs finish, in any order.
 
         Raises:
+            RequestError: no process can be started.
             DeviceError: there is no usable device, or a kernel does not compile.
             OutputError: nothing more can be written.
         """
         all_jobs = list(jobs)
-        self._remaining = deque(all_jobs)
+        self._count = min(self._count, max(len(all_jobs), 1))
         try:
-            count = min(self._count, max(len(all_jobs), 1))
-            for number in range(count):
-                try:
-                    self._processes.append(self._start(number))
-                except RequestError:
-                    if not self._processes:
-                        raise
-                    self._count = number  # the system allows no more processes
-                    break
-            self._distribute_jobs()
-            while not self._is_finished:
-                process, message = self._messages.get()
-                if process is None:
-                    self._stop_processes()
-                else:
-                    yield from self._handle(process, message)
-                    self._distribute_jobs()
+            _start_trackers()
+            for number in range(self._count):
+                self._start(number)
+            yield from self._outcomes(all_jobs)
         finally:
-            self._end()
-            patches = self._spec.request.patch is not None
-            # Remove the unfinished files of processes that died.
-            remove_unfinished(self._spec.execution.output, all_jobs, patches)
-        if self._failure:
-            raise self._failure
+            self._halt()
+            for process in self._processes.values():
+                process.close()
+            self._remove_unfinished(all_jobs)
 
-    @property
-    def _is_finished(self) -> bool:
-        if any(process.jobs for process in self._processes):
-            return False
-        if self.is_stopping:
-            return not self._processes
-        return not self._remaining and not self._suspects
-
-    def _start(self, number: int) -> _Process:
-        """Start one of the processes.
+    def _start(self, number: int) -> None:
+        """Start a process.
 
         Raises:
-            RequestError: the system refuses.
+            RequestError: the system allows none. If it allows no more, the others do without.
         """
-        available, count = processor_numbers(), self._count
-        share = max(available_processors() // count, 1)
-        own_processors: tuple[int, ...] = ()
-        if len(available) == available_processors() >= count:
-            own_processors = tuple(
-                available[number * len(available) // count : (number + 1) * len(available) // count]
-            )
-            share = len(own_processors)
-        sequential = share == 1 and self._is_small
-        config = ProcessConfig(
-            number,
-            count,
-            share,
-            own_processors,
-            sequential,
-            logging.getLogger("clpipe").getEffectiveLevel(),
-        )
-        limits = {name: os.environ.get(name, str(share)) for name in THREADS}
-        program = PROGRAM.format(path=json.dumps(sys.path), start=START)
+        from loky import ProcessPoolExecutor
+        from loky.backend import get_context
+
+        level = logging.getLogger("clpipe").getEffectiveLevel()
+        ours, theirs = multiprocessing.Pipe()
         try:
-            parent_end, child_end = multiprocessing.Pipe()
-            with blocked_signals(SIGNALS), child_end:
-                file = child_end.fileno()
-                popen = subprocess.Popen(  # noqa: S603 - this program
-                    # -P: do not import modules from the working directory.
-                    [sys.executable, "-P", "-c", program, str(file)],
-                    stdin=subprocess.DEVNULL,
-                    stdout=2,  # libraries may print; stdout is for the run's own output
-                    pass_fds=[file],
-                    env={**os.environ, **limits},
+            with blocked_signals(SIGNALS), theirs:
+                pool = ProcessPoolExecutor(
+                    1,
+                    context=get_context("loky"),
+                    initializer=prepare,
+                    initargs=(theirs, level),
+                    env=ENVIRONMENT,
                 )
+                part = Part(number, self._count, self._is_small)
+                listener = threading.Thread(target=self._log, args=(ours,), daemon=True)
+                process = _Process(part, pool, ours, listener)
+                self._call(process, [])
+                listener.start()
         except OSError as error:
-            raise RequestError(
-                f"--processes: {self._count}: no process can be started ({error.strerror}); ask "
-                "for fewer"
-            ) from None
-        process = _Process(config, popen, parent_end)
-        self._send(process, self._spec, config)
-        process.listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
-        process.listener.start()
-        return process
+            if not self._processes:
+                raise RequestError(
+                    f"--processes: {self._count}: no process can be started ({error.strerror}); "
+                    "ask for fewer"
+                ) from None
+        else:
+            self._processes[number] = process
 
-    def _listen(self, process: _Process) -> None:
-        try:
+    def _log(self, connection: Connection) -> None:
+        """Log what a process logs until it ends. Each text appears once."""
+        with suppress(EOFError, OSError):
             while True:
-                self._messages.put((process, process.connection.recv()))
-        except Exception:  # EOFError marks the end; a damaged message counts as the end
-            self._messages.put((process, ("gone",)))
-
-    @staticmethod
-    def _send(process: _Process, *message: object) -> None:
-        """Send a message. If the process has died, its listener reports that."""
-        with contextlib.suppress(OSError):
-            process.connection.send(message)
-
-    def _handle(self, process: _Process, message: tuple[object, ...]) -> Iterable[Outcome]:
-        """Handle a message from a process, and return the outcomes that follow from it."""
-        match message:
-            case ("ready",):
-                process.is_ready, self._early_deaths = True, 0
-            case ("compiled",):
-                self._is_compiled = True
-            case ("outcomes", list(outcomes)):
-                self._is_compiled, self._fruitless_deaths = True, 0
-                for outcome in outcomes:
-                    del process.jobs[outcome.job.stem]
-                process.is_alone &= bool(process.jobs)
-                return [shifted(outcome, 0.0, f"{process.config.number} ") for outcome in outcomes]
-            case ("log", int(level), str(text)):
-                if text not in self._logged:  # every process logs the same text
+                record = connection.recv()
+                if (text := record.getMessage()) not in self._logged:
                     self._logged.add(text)
-                    log.log(level, "%s", text)
-            case ("failed", ClpipeError() as error):
-                self._failure = self._failure or error
-                process.jobs.clear()
-                self.stop()
-            case ("end",) | ("gone",):
-                return self._handle_death(process) if process in self._processes else ()
-        return ()
+                    logging.getLogger(record.name).handle(record)
 
-    def _distribute_jobs(self) -> None:
-        """Give each process its next jobs, and replace processes that died.
+    def _call(self, process: _Process, jobs: Sequence[Job]) -> None:
+        """Give jobs to a process. It reports when it needs more, or when it has done the last."""
+        limit = len(jobs) if self._is_compiled and self._chunks.jobs else 0
+        stamps = listed_stamps(path for job in jobs for path in job.paths)
+        try:
+            call = process.pool.submit(run_chunk, self._spec, process.part, jobs, stamps, limit)
+        except BrokenExecutor as error:  # it has died since its last call
+            call = Future()
+            call.set_exception(error)
+        process.held |= {job.stem: job for job in jobs}
+        process.call = call
+        self._held[call] = process.held
+        call.add_done_callback(self._finished.put)
 
-        Raises:
-            RequestError: no process can be started.
-        """
-        if self.is_stopping:
-            return
-        while len(self._processes) < self._count and self._remaining and self._is_compiled:
-            taken = {process.config.number for process in self._processes}
-            self._processes.append(self._start(min({*range(self._count)} - taken)))
+    def _submit_chunks(self) -> bool:
         # The first process compiles the kernels and caches them for the others.
-        for process in self._processes if self._is_compiled else self._processes[:1]:
-            if process.is_alone:
+        processes = [*self._processes.values()]
+        least = (self._spec.execution.threads or available_processors() // self._count) + 3
+        for process in processes if self._is_compiled else processes[:1]:
+            if process.call in self._held:
                 continue
-            threads = self._spec.execution.threads or process.config.threads
-            min_queued = MIN_QUEUED if process.config.sequential else threads + 3
-            max_queued = max(min(MAX_QUEUED, len(self._remaining) // (2 * self._count)), min_queued)
-            # A message for only one or two jobs is not worthwhile.
-            if len(process.jobs) > max_queued // 2:
-                continue
-            count = min(max_queued - len(process.jobs), len(self._remaining))
-            if not count and self._suspects and not process.jobs:
-                process.is_alone = True
-                self._give(process, [self._suspects.popleft()])
-            elif count:
-                self._give(process, [self._remaining.popleft() for _ in range(count)])
+            jobs: list[Job] = []
+            if not self.is_stopping:
+                jobs = self._chunks.cut(self._count, least if self._is_compiled else 1)
+                if not jobs and not process.held and self._chunks.suspects:
+                    jobs = [self._chunks.suspects.popleft()]
+            if jobs or process.held:
+                self._call(process, jobs)
+        return bool(self._held)
 
-    def _give(self, process: _Process, jobs: Sequence[Job]) -> None:
-        process.jobs |= {job.stem: job for job in jobs}
-        self._send(process, "jobs", jobs, listed_stamps(path for job in jobs for path in job.paths))
+    def _result(self, future: Any, held: Mapping[str, Job]) -> ChunkReport:
+        process = next(each for each in self._processes.values() if each.call is future)
+        try:
+            report: ChunkReport = future.result()
+        except Exception as error:  # of the pool, or a defect of clpipe
+            end = _end_of(error)
+            self._replace(process, end)
+            reason = f"killed the process that took it, 2 times; the last one {end}"
+            raise WorkerDiedError(reason) from error
+        process.is_ready = True
+        self._is_compiled |= bool(report.outcomes)
+        del self._deaths[MADE if report.outcomes else OPENED]
+        for outcome in report.outcomes:
+            del process.held[outcome.job.stem]
+        if not report.unfinished:
+            process.held.clear()  # a stopped process does not begin all jobs
+        return report
 
-    def _handle_death(self, process: _Process) -> Iterable[Outcome]:
-        """Handle the end of a process: others get its jobs. Returns the outcomes of failed jobs.
+    def _replace(self, process: _Process, end: str) -> None:
+        """Start another process after the death of one.
 
         Raises:
             DeviceError: processes keep dying without doing anything.
+            RequestError: no process is left, and none can be started.
         """
-        self._processes.remove(process)
-        status = process.close()
-        was_testing_one, jobs = process.is_alone, list(process.jobs.values())
-        process.jobs.clear()
+        number = process.part.number
+        del self._processes[number]
+        process.close(kill=True)
         if self.is_stopping:
-            return []
-        self._early_deaths += not process.is_ready
-        self._fruitless_deaths += 1
-        log.warning("a process ended %s; its %d images go to others", _exit_text(status), len(jobs))
-        if self._early_deaths >= MAX_DEATHS or self._fruitless_deaths >= MAX_FRUITLESS:
-            count, milestone = MAX_FRUITLESS, "made an image"
-            if self._early_deaths >= MAX_DEATHS:
-                count, milestone = MAX_DEATHS, "opened a device"
+            return
+        log.warning("a process ended %s; its %d images go to others", end, len(process.held))
+        milestone = MADE if process.is_ready else OPENED
+        self._deaths[milestone] += 1
+        if self._deaths[milestone] >= MAX_DEATHS[milestone]:
             raise DeviceError(
-                f"--processes: {count} processes in a row ended before they had {milestone}, "
-                f"the last one {_exit_text(status)}; --processes 1 does without"
+                f"--processes: {MAX_DEATHS[milestone]} processes in a row ended before they had "
+                f"{milestone}, the last one {end}; --processes 1 does without"
             )
-        for job in jobs:
-            self._deaths[job.stem] += 1
-        given_up = [job for job in jobs if was_testing_one and self._deaths[job.stem] >= MAX_DEATHS]
-        self._suspects.extend(job for job in jobs if job not in given_up)
-        if not self._processes:
-            self._processes.append(self._start(process.config.number))
-        end = _exit_text(status)
-        text = f"killed the process that took it, {MAX_DEATHS} times; the last one {end}"
-        return [
-            Outcome(job, FAILED, error=f"{job.display_name}: {text}", error_class="unexpected")
-            for job in given_up
-        ]
+        self._start(number)
 
-    def _stop_processes(self) -> None:
-        for process in self._processes:
-            self._send(process, "stop")
-
-    def _end(self) -> None:
-        """End all processes, and wait for them."""
-        for process in self._processes:
-            self._send(process, "stop" if process.jobs else "end")
-        for process in self._processes:
-            process.close()
-        while not self._messages.empty():  # the last errors and log lines
-            process_, message = self._messages.get()
-            if process_ and message[0] in ("failed", "log"):
-                self._handle(process_, message)
+    def _halt(self) -> None:
+        for process in self._processes.values():
+            with suppress(OSError):  # its death is reported by its pool
+                process.connection.send_bytes(b"stop")
 
 
-def _exit_text(status: int) -> str:
-    """Describe how a process ended, from its exit status.
+def _start_trackers() -> None:
+    """Start the two processes that remove the semaphores of pools if this process is killed.
 
-    >>> _exit_text(-9), _exit_text(1)
-    ('by signal 9', 'with status 1')
+    They may not import modules from the working directory, and remove semaphores silently.
     """
+    from loky.backend import resource_tracker as loky_tracker
+
+    before = {name: os.environ[name] for name in TRACKERS if name in os.environ}
+    os.environ.update(TRACKERS)
+    try:
+        loky_tracker.ensure_running()
+        standard_tracker.ensure_running()
+    finally:
+        for name in TRACKERS:
+            del os.environ[name]
+        os.environ.update(before)
+
+
+def _end_of(error: Exception) -> str:
+    """Describe how a process ended, from the error of its call.
+
+    >>> _end_of(RuntimeError("The exit codes of the workers are {SIGKILL(-9)}"))
+    'by signal 9'
+    >>> _end_of(RuntimeError("The exit codes of the workers are {EXIT(1)}"))
+    'with status 1'
+    >>> _end_of(KeyError("a"))
+    "with KeyError: 'a'"
+    """
+    match = re.search(r"workers are \{\w+\((-?\d+)\)", str(error))
+    if not match:
+        return f"with {type(error).__name__}: {error}"
+    status = int(match[1])
     return f"by signal {-status}" if status < 0 else f"with status {status}"

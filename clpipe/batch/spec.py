@@ -1,6 +1,6 @@
 """The description of a run that is sent to other processes, on this machine or on others."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -47,7 +47,6 @@ class RunSpec:
         threads: int,
         sharing: int,
         in_flight: int | None = None,
-        compiled: Callable[[], None] = lambda: None,
     ) -> Batch:
         """Return the batch that does this process's part of the run.
 
@@ -56,11 +55,10 @@ class RunSpec:
             threads: the number of threads if the run does not set it.
             sharing: the number of processes that share the machine's memory.
             in_flight: as for :class:`~clpipe.batch.threads.Batch`.
-            compiled: as for :class:`~clpipe.batch.threads.Batch`.
         """
         number = self.execution.threads or threads
         memory = default_budget(sharing)
-        return Batch(self.worker(), devices, number, memory, in_flight, compiled)
+        return Batch(self.worker(), devices, number, memory, in_flight)
 
 
 def shifted(outcome: Outcome, seconds: float, prefix: str = "") -> Outcome:

@@ -50,7 +50,6 @@ class Batch:
             :func:`~clpipe.batch.memory_budget.default_budget`.
         in_flight: the number of threads that make images. None is enough to keep all others busy.
             A single thread takes several small images at a time.
-        compiled: called when a device has compiled its kernels.
     """
 
     def __init__(
@@ -60,7 +59,6 @@ class Batch:
         threads: int | None = None,
         memory: int | None = None,
         in_flight: int | None = None,
-        compiled: Callable[[], None] = lambda: None,
     ) -> None:
         self.devices = list(devices)
         self.threads = threads or available_processors()
@@ -74,9 +72,7 @@ class Batch:
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._decoding = threading.Semaphore(self.threads)  # limits the threads that decode
-        self._renditions = Developing(
-            worker, self.devices, self.threads, self._budget, compiled, self._fail
-        )
+        self._renditions = Developing(worker, self.devices, self.threads, self._budget, self._fail)
         develop = self._renditions.service.run
         self._metering = Metering(worker, self._acquire_for_metering, develop)
         self._jobs: Jobs = queue.SimpleQueue()
@@ -104,7 +100,7 @@ class Batch:
         """
         return self._metering.jobs(jobs)
 
-    def run(self, jobs: Iterable[Job] | Jobs) -> Generator[Outcome, None, None]:
+    def run(self, jobs: Iterable[Job]) -> Generator[Outcome, None, None]:
         """Do every job, and yield outcomes as jobs finish, in any order. A batch runs once.
 
         Args:
@@ -119,9 +115,7 @@ class Batch:
         codecs = max(available_processors() // min(self.threads, count), 1)
         set_codec_threads(codecs)
         self.in_flight = min(self.in_flight, count)
-        if isinstance(jobs, queue.SimpleQueue):
-            self._jobs = jobs
-        elif isinstance(jobs, Sized):
+        if isinstance(jobs, Sized):
             self._queue(jobs)
         else:
             self._start("jobs", self._queue, jobs)
