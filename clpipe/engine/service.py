@@ -290,6 +290,7 @@ class _Server:
                     return
                 for each in unfinished:
                     each.set_exception(error)
+            taken = []  # it holds images
 
     def _leaves(self, error: BaseException, unfinished: Sequence[Development]) -> bool:
         """Return whether other devices develop the frames of this one, which has failed."""
