@@ -86,12 +86,12 @@ class SampleSpec:
         if self.truth:
             chains["truth"] = picture_without_noise(self.truth, chain)
 
-        def frame(chain: Chain, keep: Sequence[str], encode: bool) -> Frame:
-            kept = tuple(step for step in chain.step_names if step in keep)
+        def frame(chain: Chain, keep: tuple[str, ...], encode: bool) -> Frame:
+            kept = steps_in(chain, keep)
             return Frame(chain, source.pixels, noise_key, kept, encode, not encode, options)
 
         frames = {
-            name: frame(each, (*self.keep, *filter(None, [raws.get(name)])), encode)
+            name: frame(each, (*self.keep, raws[name]) if raws else self.keep, encode)
             for name, each in chains.items()
         }
         if self.variance:
@@ -198,6 +198,12 @@ class DevelopTask:
         for name, layer in self.carried.items():
             sample[name] = arrays.ordered(patch.crop(layer) if patch else layer)
         return sample
+
+
+@cached_by_structure
+def steps_in(chain: Chain, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return those of several steps that a chain contains, in its order."""
+    return tuple(step for step in chain.step_names if step in names)
 
 
 @cached_by_structure
