@@ -12,7 +12,8 @@ import pytest
 
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import NotTraceableError, Trace, call, float32, traceable
+from clpipe.base.pure import pure
+from clpipe.base.tracing import NotTraceableError, Trace, call
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import COMPUTED, STRUCTURAL, Chain
 from clpipe.chain.families import ComputedChain
@@ -216,7 +217,7 @@ def test_a_changed_file_is_read_again(families, tmp_path):
 
 
 def test_operations_are_repeated_in_order():
-    halves = traceable(lambda x: divmod(x, 0.5))
+    halves = pure(lambda x: divmod(x, 0.5))
 
     def computed(x, y):
         z = x / y - 2 * x + y**2 if x > y else -x + 1 / y
@@ -224,7 +225,7 @@ def test_operations_are_repeated_in_order():
         return {
             "a": (z, abs(z) % 3, *halves(x)),
             "b": [max(x, y), 7, *numpys],
-            "c": float32(x) * np.float32(0.1),
+            "c": pure(np.float32)(x) * np.float32(0.1),
         }
 
     trace = Trace([3.0, 2.0])

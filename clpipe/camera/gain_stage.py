@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from clpipe.base.tracing import call
+from clpipe.base.pure import pure
 
 MAX_VALUE = 1e9  # the largest value of a sensor, so that its square is finite as well
 Positive = Annotated[float, Field(gt=0, le=MAX_VALUE, allow_inf_nan=False)]
@@ -66,7 +66,7 @@ class GainStage(BaseModel):
         >>> round(stage.interpolate(200, (0.1, 0.2)), 6), stage.interpolate(800, (0.1, 0.2))
         (0.15, 0.2)
         """
-        return call(_interpolate, iso, self.iso, self._logs, values)
+        return _interpolate(iso, self.iso, self._logs, values)
 
     @cached_property
     def _logs(self) -> list[float]:
@@ -92,11 +92,12 @@ class GainStage(BaseModel):
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
 
 
-@lru_cache(maxsize=1024)  # equal tables share one object, so that it is traced once
+@lru_cache(maxsize=1024)  # equal tables share one object, so that chains share it
 def _ratios(values: tuple[float, ...], divisors: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(value / divisor for value, divisor in zip(values, divisors, strict=True))
 
 
+@pure
 def _interpolate(
     iso: float, isos: Sequence[float], logs: Sequence[float], values: Sequence[float]
 ) -> float:

@@ -7,7 +7,7 @@ describe which pixels contribute to a pixel, so they are the mirror image.
 
 import numpy as np
 
-from clpipe.base.tracing import traceable
+from clpipe.base.pure import pure
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.image import tap
 
@@ -36,7 +36,7 @@ def taps_of(psf: Doubles) -> Floats:
     return np.ascontiguousarray(np.hstack([offsets, weights]), np.float32)
 
 
-@traceable
+@pure
 def tap_radius(taps: Floats) -> int:
     """Return the largest distance of a tap along a row or a column, in px."""
     return int(abs(taps[:, :2]).max())

@@ -8,7 +8,7 @@ from math import gamma
 
 import numpy as np
 
-from clpipe.base.tracing import traceable
+from clpipe.base.pure import pure
 from clpipe.base.types import Floats
 from clpipe.reference.math import exponential_minus_1, negative_log
 from clpipe.reference.random import Words, in_upper_half, tail_probability
@@ -17,7 +17,7 @@ from clpipe.reference.random import Words, in_upper_half, tail_probability
 NEARLY_ZERO = 1e-4
 
 
-@traceable
+@pure
 def shape_and_scale(shape: float) -> tuple[np.float32, np.float32]:
     """Return the kernel's arguments for a shape lambda above -1/2: lambda and 1 / (lambda * sigma).
 

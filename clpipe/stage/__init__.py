@@ -8,6 +8,7 @@ Stage files import only the names in ``__all__`` here, and only from here. This 
 ``camera``, ``reference`` and ``base``, and nothing about chains, devices or files.
 """
 
+from clpipe.base.pure import pure
 from clpipe.base.types import Array, Floats
 from clpipe.stage.arrays import PERIOD, levels_table, period_of
 from clpipe.stage.bases import (
@@ -87,6 +88,7 @@ __all__ = [
     "parameter",
     "period_of",
     "principal_point_parameter",
+    "pure",
     "run_reference",
     "sensor_bits",
     "sensor_normals",

@@ -214,8 +214,15 @@ class Method(BaseModel):
         raise NotImplementedError(type(self).__name__)
 
     def with_defaults(self, **values: Any) -> Self:
-        """Return a copy in which ``values`` replace the parameters that are None."""
-        missing = {k: v for k, v in values.items() if getattr(self, k) is None and v is not None}
+        """Return a copy in which ``values`` replace the parameters that are None.
+
+        NumPy's numbers become those of Python.
+        """
+        missing = {
+            name: value.item() if hasattr(value, "item") else value
+            for name, value in values.items()
+            if getattr(self, name) is None and value is not None
+        }
         return self.model_copy(update=missing) if missing else self
 
 

@@ -5,7 +5,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
@@ -83,10 +82,10 @@ class Sine(SignalMethod):
         )
 
     @property
-    def frequency(self) -> np.float32:
+    def frequency(self) -> float:
         """The frequency of the wave, in turns per row."""
         assert self.period is not None
-        return float32(1 / self.period)
+        return 1 / self.period
 
     def arguments(self, context: Context) -> Arguments:
         return {"frequency": self.frequency, "amplitude": self.amplitude}

@@ -5,7 +5,6 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
@@ -82,9 +81,9 @@ class Offsets(SignalMethod):
             Pass("black_level_error", arguments=("in_even", "in_odd")),
         )
 
-    def _bias_by_site(self, pattern: str) -> dict[tuple[int, int], np.float32]:
+    def _bias_by_site(self, pattern: str) -> dict[tuple[int, int], float]:
         """Return the fixed offset at a column and row of the filter array."""
-        offsets = (float32(bias + self.offset) for bias in self.bias or (0.0,) * 4)
+        offsets = (bias + self.offset for bias in self.bias or (0.0,) * 4)
         red, with_red, with_blue, blue = offsets
         green = with_red if "R" in pattern[:2] else with_blue
         other_green = with_blue if "R" in pattern[:2] else with_red

@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-from clpipe.base.tracing import float32
 from clpipe.stage import (
     Arguments,
     Backend,
@@ -65,8 +64,8 @@ class Column(SignalMethod):
         return (Pass("blooming", Stencil(RADIUS), ("full", "first", "spill")),)
 
     def arguments(self, context: Context) -> Arguments:
-        first, spill = float32((1 - self.spill) / 2), float32(self.spill)
-        return {"full": self.full_signal, "first": first, "spill": spill}
+        first = (1 - self.spill) / 2
+        return {"full": self.full_signal, "first": first, "spill": self.spill}
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -5,7 +5,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
@@ -138,11 +137,11 @@ class Thermal(SignalMethod):
         )
 
     @property
-    def _charge(self) -> tuple[np.float32, np.float32, np.float32]:
+    def _charge(self) -> tuple[float, float, float]:
         """Return the mean charge, its deviation over pixels, and the signal of an electron."""
         assert self.spread is not None and self.per_electron is not None
         mean = self.electrons * self.per_electron
-        return float32(mean), float32(mean * self.spread), float32(self.per_electron)
+        return mean, mean * self.spread, self.per_electron
 
     def arguments(self, context: Context) -> Arguments:
         mean, spread, electron = self._charge
@@ -151,7 +150,7 @@ class Thermal(SignalMethod):
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         if not self.electrons:
             return input_variance
-        mean, spread, electron = self._charge
+        mean, spread, electron = map(np.float32, self._charge)
         return input_variance + (mean * electron + spread * spread)
 
     @classmethod

@@ -9,7 +9,6 @@ from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
 from clpipe.base.reading import cached_by_mtime, read_errors
-from clpipe.base.tracing import float32
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
 from clpipe.stage import (
@@ -130,15 +129,15 @@ class Smooth(SignalMethod):
             Pass("dark_shading", arguments=("slope", "offset", *tables)),
         )
 
-    def _amplitudes(self, iso: float) -> tuple[np.float32, np.float32]:
+    def _amplitudes(self, iso: float) -> tuple[float, float]:
         """The factors of the products in both maps that give the maps their standard deviations."""
         assert self.slope is not None and self.offset is not None
-        return float32(self.slope * iso / sqrt(2)), float32(self.offset / sqrt(2))
+        return self.slope * iso / sqrt(2), self.offset / sqrt(2)
 
     @property
-    def _per_px(self) -> np.float32:
+    def _per_px(self) -> float:
         assert self.length is not None
-        return float32(1 / self.length)
+        return 1 / self.length
 
     def arguments(self, context: Context) -> Arguments:
         slope, offset = self._amplitudes(context.iso)
@@ -151,8 +150,8 @@ class Smooth(SignalMethod):
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
-        of_iso = backend.fixed(shading, lambda method, _: (method._per_px, 0))
-        fixed = backend.fixed(shading, lambda method, _: (method._per_px, PRODUCTS))
+        of_iso = backend.fixed(shading, lambda method, _: (np.float32(method._per_px), 0))
+        fixed = backend.fixed(shading, lambda method, _: (np.float32(method._per_px), PRODUCTS))
         return y + (of_iso * n["slope"] + fixed * n["offset"])
 
 
@@ -245,8 +244,7 @@ class File(SignalMethod):
             return {}
         shading_map = self._map(context.iso)
         height, width = shading_map.shape
-        sizes = {"width": np.int32(width), "height": np.int32(height)}
-        return {"map": shading_map, **sizes, "per_px": 1 / self.block}
+        return {"map": shading_map, "width": width, "height": height, "per_px": 1 / self.block}
 
     def without_noise(self) -> Method | None:
         return None if self.passes() else self

@@ -84,8 +84,8 @@ class Random(SignalMethod):
     def arguments(self, context: Context) -> Arguments:
         hot_limit, dead_limit = self.limits()
         return {
-            "hot_limit": np.int32(hot_limit),
-            "dead_limit": np.int32(dead_limit),
+            "hot_limit": hot_limit,
+            "dead_limit": dead_limit,
             "hot_scale": 1 / max(hot_limit, 1),
             "hot_level": self.hot_level,
         }

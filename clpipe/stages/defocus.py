@@ -225,11 +225,11 @@ class ThinLens(FocalLengthMethod, LayerMethod):
         radii, reach, taps = layer.derived.get(self, lambda: self._tables(layer.pixels))
         return {
             "radii": radii,
-            "columns": np.int32(radii.shape[1]),
-            "rows": np.int32(radii.shape[0]),
-            "reach": np.int32(reach),
+            "columns": radii.shape[1],
+            "rows": radii.shape[0],
+            "reach": reach,
             "taps": taps,
-            "count": np.int32(len(taps)),
+            "count": len(taps),
         }
 
     def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:

@@ -3,14 +3,13 @@
 from functools import lru_cache
 from typing import ClassVar
 
-from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
 from clpipe.reference.transfer import srgb_curve
-from clpipe.stage import Curve, Kind, Stage, StageRole, parameter
+from clpipe.stage import Curve, Kind, Stage, StageRole, parameter, pure
 
 
-@traceable
+@pure
 @lru_cache(maxsize=16)
 def power_table(exponent: float) -> Floats:
     """Return the table of x^exponent; cached, so that it is uploaded once."""

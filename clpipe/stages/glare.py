@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
@@ -62,7 +61,7 @@ class Veil(Method):
         return Pass("glare_sample", means), spread
 
     def arguments(self, context: Context) -> Arguments:
-        return {"share": self.share, "kept": float32(1 - self.share)}
+        return {"share": self.share, "kept": 1 - self.share}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.share:

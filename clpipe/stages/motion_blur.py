@@ -7,7 +7,6 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, tap_radius, taps_of
 from clpipe.reference.turning import BILINEAR, CameraRotation
@@ -25,13 +24,14 @@ from clpipe.stage import (
     StageRole,
     Stencil,
     parameter,
+    pure,
 )
 
 MAX_LENGTH = 200.0  # px; the longest streak
 TAPS_PER_PIXEL = 64  # kernel taps per pixel of a streak's length
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def streak(length: float, angle: float) -> Floats:
     """Return the taps of a straight streak with the same light along its length.
@@ -155,7 +155,7 @@ class Linear(Method):
     def arguments(self, context: Context) -> Arguments:
         if not self.pixels:
             return {}
-        return {"taps": self.taps, "count": np.int32(len(self.taps))}
+        return {"taps": self.taps, "count": len(self.taps)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return convolve(image, self.taps) if self.pixels else image

@@ -6,7 +6,6 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.companding import apply_pieces, parse_knots, pieces_of
 from clpipe.stage import (
@@ -101,7 +100,7 @@ class Linear(SignalMethod):
 
     def arguments(self, context: Context) -> Arguments:
         assert self.black_level is not None and self.white_level is not None
-        scale = float32(1 / (self.white_level - self.black_level))
+        scale = 1 / (self.white_level - self.black_level)
         return {"black_level": self.black_level, "scale": scale}
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.tracing import int32, traceable
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, tap_radius, taps_of
 from clpipe.stage import (
@@ -26,6 +25,7 @@ from clpipe.stage import (
     Stencil,
     Unchanged,
     parameter,
+    pure,
 )
 from clpipe.stages.vignetting import relative_radius
 
@@ -133,7 +133,7 @@ def read_psf(path: str) -> Doubles:
     return np.asarray(pixels / total)
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def half_line_spread(sigma: float, low_pass: float, pixel_area: float) -> Floats:
     """Return the middle and one side of :func:`line_spread`, without negligible weights.
@@ -148,7 +148,7 @@ def half_line_spread(sigma: float, low_pass: float, pixel_area: float) -> Floats
     return np.asarray(kept / (2 * kept.sum() - kept[0]), np.float32)
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats, Floats]:
     """Return the taps of :func:`half_line_spread` along a row, and those along a column."""
@@ -157,7 +157,7 @@ def line_taps(sigma: float, low_pass: float, pixel_area: float) -> tuple[Floats,
     return taps_of(row), taps_of(row.transpose(1, 0, 2))
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def lens_taps(
     sigma: float, low_pass: float, pixel_area: float, f_number: float, pitch: float, psf: str
@@ -323,12 +323,12 @@ class Lens(Method):
     def _even_arguments(self) -> Arguments:
         lines = self._separable_arguments
         if lines is None:
-            return {"taps": self._taps, "count": int32(len(self._taps))}
+            return {"taps": self._taps, "count": len(self._taps)}
         weights = half_line_spread(*lines)
         if len(weights) - 1 <= MAX_UNROLLED_RADIUS:
             return {"reach": CompileTime(str(len(weights) - 1)), "weights": weights}
         across, down = line_taps(*lines)
-        return {"across": across, "down": down, "count": int32(len(across))}
+        return {"across": across, "down": down, "count": len(across)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         resolved = self.resolve(inputs.context)

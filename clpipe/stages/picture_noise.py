@@ -15,7 +15,6 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import cached_by_mtime, parse_json, read_bytes
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
 from clpipe.reference.curve import to_8_bit
@@ -212,7 +211,7 @@ class IidGaussian(IndependentNoise):
 
     def arguments(self, context: Context) -> Arguments:
         assert self.sigma is not None
-        sigmas = zip(("red", "green", "blue"), map(float32, self.sigma), strict=True)
+        sigmas = zip(("red", "green", "blue"), self.sigma, strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:

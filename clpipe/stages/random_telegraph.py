@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32, int32
 from clpipe.base.types import Floats
 from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
@@ -79,16 +78,10 @@ class TwoLevels(SignalMethod):
             Pass("telegraph", reads=("levels",), random=NoiseScope.IMAGE),
         )
 
-    @property
-    def _limit_and_scale(self) -> tuple[np.int32, np.float32]:
-        """Return the words below which a pixel is chosen, and 1 over their number."""
-        assert self.share is not None
-        limit = round(self.share * RANDOM_WORDS)
-        return int32(limit), float32(1 / max(limit, 1))
-
     def arguments(self, context: Context) -> Arguments:
-        limit, scale = self._limit_and_scale
-        return {"limit": limit, "scale": scale, "amplitude": self.amplitude}
+        assert self.share is not None
+        limit = round(self.share * RANDOM_WORDS)  # the words below it choose a pixel
+        return {"limit": limit, "scale": 1 / max(limit, 1), "amplitude": self.amplitude}
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
 from clpipe.stages.white_balance.gains import CameraGains, gain_parameter
@@ -40,7 +39,7 @@ class Brooks2019(CameraGains):
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
 
     def arguments(self, context: Context) -> Arguments:
-        red, blue = map(float32, self.gains)
+        red, blue = self.gains
         return {"red_gain": red, "blue_gain": blue}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:

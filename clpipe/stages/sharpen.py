@@ -5,7 +5,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import traceable
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.image import tap
@@ -22,6 +21,7 @@ from clpipe.stage import (
     Stencil,
     Unchanged,
     parameter,
+    pure,
 )
 from clpipe.stages.denoise.strength import (
     MID_GREY,
@@ -42,7 +42,7 @@ def blur_step(radius: float) -> int:
     return 1 if radius < 2 else 2
 
 
-@traceable
+@pure
 @lru_cache(maxsize=64)
 def blur_weights(radius: float) -> Floats:
     """Return the weights of a Gaussian blur 0, 1, 2... steps away, to twice the radius, rounded.

@@ -5,12 +5,10 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
-    Argument,
     Arguments,
     CompileTime,
     Context,
@@ -78,8 +76,7 @@ class Pa(Method):
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
 
     def arguments(self, context: Context) -> Arguments:
-        coefficients = {name: float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
-        return {"extent": CompileTime("e"), **coefficients}
+        return {"extent": CompileTime("e"), "k1": self.k1, "k2": self.k2, "k3": self.k3}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         r2 = relative_radius(image)
@@ -129,15 +126,15 @@ class CosineFourth(FocalLengthMethod, PrincipalPointMethod):
         centre = {"x": _coordinate(self.cx, "width"), "y": _coordinate(self.cy, "height")}
         return {"extent": CompileTime("e"), **centre, "per_px": per_px, "per_side": per_side}
 
-    def _inverse_focal_squared(self) -> tuple[np.float32, np.float32]:
+    def _inverse_focal_squared(self) -> tuple[float, float]:
         """Return 1 over the squared focal length in px, or in longer sides; the other one is 0."""
         if self.fx:
-            return float32(self.fx**-2), float32(0)
+            return self.fx**-2, 0.0
         assert self.focal_length and self.sensor_width
-        return float32(0), float32((self.sensor_width / self.focal_length) ** 2)
+        return 0.0, (self.sensor_width / self.focal_length) ** 2
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        per_px, per_side = self._inverse_focal_squared()
+        per_px, per_side = map(np.float32, self._inverse_focal_squared())
         side: Floats = np.full(1, max(image.shape[:2]), np.float32)
         unit = per_px or per_side * _reciprocal(side * side)
         cosine = _reciprocal(_squared_radius(image, self.cx, self.cy) * unit + np.float32(1))
@@ -163,9 +160,9 @@ def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = N
     return dx * dx + (dy * dy)[:, None]
 
 
-def _coordinate(centre: float | None, side: str) -> Argument:
+def _coordinate(centre: float | None, side: str) -> float | CompileTime:
     """Return a coordinate of the principal point; None is the centre, which a kernel computes."""
-    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else float32(centre)
+    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else centre
 
 
 def _reciprocal(x: Floats) -> Floats:

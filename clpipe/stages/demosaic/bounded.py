@@ -4,7 +4,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import float32, sqrt
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
@@ -130,13 +129,15 @@ class Bounded(Method):
 
     def resolve(self, context: Context) -> Self:
         _, green, _ = noise_of_colours(context)
-        return self.with_defaults(noise=sqrt(green.at(MID_GREY)), offset=offset_of_roots(context))
+        return self.with_defaults(
+            noise=np.sqrt(green.at(MID_GREY)), offset=offset_of_roots(context)
+        )
 
     @property
-    def noise_margin(self) -> np.float32:
+    def noise_margin(self) -> float:
         """The noise that green may have, in roots: three sigma plus an invisible difference."""
         assert self.noise is not None and self.offset is not None
-        return float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
+        return 0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset)
 
     def passes(self) -> tuple[Pass, ...]:
         return (
@@ -174,7 +175,7 @@ class Bounded(Method):
         differences = spread_differences(known, pattern)
         red, green, blue = np.moveaxis(from_differences(roots, pattern, *differences), -1, 0)
         (red_low, blue_low), (red_high, blue_high) = bounds(
-            roots, known, green, pattern, self.noise_margin
+            roots, known, green, pattern, np.float32(self.noise_margin)
         )
         red, blue = np.clip(red, red_low, red_high), np.clip(blue, blue_low, blue_high)
         return from_root(in_steps(np.stack([red, green, blue], axis=-1)), offset)

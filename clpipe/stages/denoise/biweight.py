@@ -1,11 +1,10 @@
 """Means weighted by Tukey's biweight, which leave grain like a camera's."""
 
 from collections.abc import Iterable
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.tracing import hypot
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import smooth, tap
@@ -133,7 +132,7 @@ class Biweight(Denoiser):
         """The differences of luma and of chroma that have the weight 0, in roots of the signal."""
         luma, chroma = self.roots
         ranges = (
-            RANGE_LUMA * self.luma_strength * hypot(luma, MIN_NOISE),
+            RANGE_LUMA * self.luma_strength * np.hypot(luma, MIN_NOISE),
             RANGE_CHROMA * self.chroma_strength * chroma,
         )
         return max(ranges[0], 1e-6), max(ranges[1], 1e-6)
@@ -141,7 +140,7 @@ class Biweight(Denoiser):
     @property
     def luma_share(self) -> float:
         """The weight of the squared difference of luma in that of colours."""
-        reach = RANGE_GUIDE * hypot(self.roots[0], MIN_NOISE)
+        reach = RANGE_GUIDE * np.hypot(self.roots[0], MIN_NOISE)
         return (self.ranges[0] / reach) ** 2
 
     def noise_free(self, context: Context) -> Method:
@@ -198,7 +197,7 @@ class Biweight(Denoiser):
         luma, guide = planes[..., :1], smooth(planes)
         chroma = guide[..., 1:]
         if not self.is_low_pass:
-            numbers: dict[str, Any] = typed_arguments(self.arguments(inputs.context))
+            numbers = typed_arguments(self.arguments(inputs.context))
             adjacent = [
                 (tap(luma, dx, dy), np.square(tap(guide[..., :1], dx, dy) - guide[..., :1]))
                 for dx, dy in ADJACENT

@@ -7,14 +7,13 @@ independent. The variance of luma noise in a grey of level v is therefore linear
 mid grey sets the strength of every method, and the strength on chroma follows in the same way.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import field_validator
 
-from clpipe.base.tracing import sqrt
 from clpipe.reference.colour import LUMA
 from clpipe.stage import (
     Arguments,
@@ -82,7 +81,7 @@ def noise_of_luma_and_chroma(context: Context) -> tuple[Variance, Variance]:
 def predicted_noise(context: Context) -> tuple[float, float]:
     """Return the standard deviations of luma and chroma noise at mid grey (0.18), signal units."""
     luma, chroma = noise_of_luma_and_chroma(context)
-    return sqrt(luma.at(MID_GREY)), sqrt(chroma.at(MID_GREY))
+    return np.sqrt(luma.at(MID_GREY)), np.sqrt(chroma.at(MID_GREY))
 
 
 def offset_of_roots(context: Context) -> float:
@@ -93,10 +92,10 @@ def offset_of_roots(context: Context) -> float:
     up the noise of luma, which appears as dots on saturated surfaces.
 
     >>> from clpipe.camera.profile import load_camera
-    >>> round(offset_of_roots(Context(load_camera("sony-a7r2"), 25600)), 4)
+    >>> round(float(offset_of_roots(Context(load_camera("sony-a7r2"), 25600))), 4)
     0.0134
     """
-    return 0.003 + 2 * sqrt(max(colour.at(0) for colour in noise_of_colours(context)))
+    return 0.003 + 2 * np.sqrt(max(colour.at(0) for colour in noise_of_colours(context)))
 
 
 def offset_parameter() -> Any:
@@ -115,7 +114,7 @@ def explain(context: Context) -> str:
     """Return the steps from a and b to luma and chroma noise, in a few lines, with their values."""
     a, b = context.noise_parameters()
     red, blue = context.applied_gains
-    sigmas = [sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
+    sigmas = [np.sqrt(colour.at(MID_GREY)) for colour in noise_of_colours(context)]
     luma, chroma = predicted_noise(context)
     source = "as sensor_noise used them" if context.noise else "from the camera"
     lines = (
@@ -208,7 +207,7 @@ class WindowDenoiser(Denoiser):
         """The largest offsets in the windows of luma and chroma, px."""
         return self.luma_size // 2, self.chroma_size // 2
 
-    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+    def numbers(self, context: Context) -> Arguments:
         """Return the run-time arguments of all passes, by name."""
         raise NotImplementedError(type(self).__name__)
 

@@ -3,9 +3,6 @@
 import math
 from typing import ClassVar, Self
 
-import numpy as np
-
-from clpipe.base.tracing import float32
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import Context, parameter
 from clpipe.stages.exposure.gain import Gain
@@ -25,6 +22,7 @@ class Photometric(Gain):
     12.8 % of full scale and a white surface at 71 %. This half a stop is headroom, which tone_curve
     gives back. A meter with K = 12.5 (ISO 2720), N^2 / t = L S / K, exposes with q K / S = 8.1 / S.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> metered = Photometric(exposure_time=0.01, f_number=8.0)  # for L = 800 at ISO 100
     >>> round(run_reference(metered, np.full((1, 1, 3), 800, np.float32)).max().item(), 4)
@@ -71,7 +69,7 @@ class Photometric(Gain):
         headroom = context.headroom + self.headroom - math.log2(WHITE)
         return context.replace(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
-    def factor(self, iso: float) -> np.float32:
+    def factor(self, iso: float) -> float:
         assert self.f_number and self.exposure_time
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
-        return float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
+        return exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom)

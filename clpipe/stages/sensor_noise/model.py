@@ -7,7 +7,6 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.tukey_lambda import shape_and_scale
@@ -193,17 +192,17 @@ class SensorNoise(SignalMethod):
         y = np.minimum(signal, np.float32(or_default(self.full_signal, NEVER_FULL)))
         return y * np.float32(self.a) + np.float32(self.b)
 
-    def numbers(self) -> dict[str, np.float32]:
+    def numbers(self) -> Arguments:
         """Return the kernel's arguments, by name."""
         raise NotImplementedError(type(self).__name__)
 
     def arguments(self, context: Context) -> Arguments:
         return self.numbers()
 
-    def read_noise_numbers(self) -> dict[str, np.float32]:
+    def read_noise_numbers(self) -> Arguments:
         """Return the kernel's arguments for read noise: sigma and, if not Gaussian, its shape."""
         assert self.b is not None
-        sigma = {"read_noise": float32(self.b**0.5)}
+        sigma: Arguments = {"read_noise": self.b**0.5}
         if self.tukey_lambda is None:
             return sigma
         shape, scale = shape_and_scale(self.tukey_lambda)

@@ -7,7 +7,6 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.errors import RequestError
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Camera
 from clpipe.reference.math import square_root
@@ -21,6 +20,7 @@ from clpipe.stage import (
     Pass,
     ReferenceContext,
     parameter,
+    typed_arguments,
 )
 from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
@@ -157,12 +157,12 @@ class Readouts(SensorNoise):
     def full_signal(self) -> float | None:
         return self._full_signal if self._is_clean else super().full_signal
 
-    def numbers(self) -> dict[str, np.float32]:
+    def numbers(self) -> Arguments:
         return {
-            "a": float32(self.a),
-            "full_well": float32(or_default(self.full_signal, NEVER_FULL)),
-            "range": float32(self._signal_range),
-            "unit": float32(1 / self._signal_range),
+            "a": self.a,
+            "full_well": or_default(self.full_signal, NEVER_FULL),
+            "range": self._signal_range,
+            "unit": 1 / self._signal_range,
         }
 
     @property
@@ -210,7 +210,7 @@ class Readouts(SensorNoise):
         def normals(draw: int) -> Floats:
             return normal_at(image.shape, draw, inputs.stream[NoiseScope.IMAGE])
 
-        n = self.numbers()
+        n = typed_arguments(self.numbers())
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):

@@ -6,7 +6,6 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import field_validator
 
-from clpipe.base.tracing import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
@@ -57,10 +56,10 @@ class Linear(Method):
         return self.with_defaults(headroom=context.headroom)
 
     @property
-    def gain(self) -> np.float32:
+    def gain(self) -> float:
         """The gain."""
         assert self.headroom is not None
-        return float32(2.0**self.headroom)
+        return 2.0**self.headroom
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),) if self.headroom else ()
@@ -69,7 +68,7 @@ class Linear(Method):
         return {"gain": self.gain}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return image * self.gain
+        return image * np.float32(self.gain)
 
 
 class File(Curve):
