@@ -26,7 +26,7 @@ from clpipe.stage.bases import (
 )
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ImageLayer, ReferenceContext
-from clpipe.stage.method import Method, Stage, StageRole, parameter
+from clpipe.stage.method import Method, Stage, StageRole, parameter, rgb_stage, sensor_stage
 from clpipe.stage.passes import (
     PREVIOUS,
     Argument,
@@ -89,9 +89,11 @@ __all__ = [
     "period_of",
     "principal_point_parameter",
     "pure",
+    "rgb_stage",
     "run_reference",
     "sensor_bits",
     "sensor_normals",
+    "sensor_stage",
     "typed_arguments",
     "variant_label",
     "variants",

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, PrivateAttr
 
@@ -233,6 +233,9 @@ def optics_names(method: type[Method]) -> tuple[str, ...]:
     return tuple(name for name, extra in extras.items() if extra and extra.get("optics"))
 
 
+Methods: TypeAlias = tuple[type[Method], ...]
+
+
 class StageRole(Enum):
     """Roles, by which the rest of clpipe finds stages, instead of by their names."""
 
@@ -272,7 +275,7 @@ class Stage:
     summary: str
     reads: Kind
     writes: Kind
-    methods: tuple[type[Method], ...]
+    methods: Methods
     explain: Callable[[Context], str] | None = None
     folder: Path | None = None  # folder of a plug-in's kernel files
     also_reads: tuple[Kind, ...] = ()
@@ -308,3 +311,15 @@ class Stage:
     def by_name(self) -> dict[str, type[Method]]:
         """The methods by their names."""
         return {m.method: m for m in self.methods}
+
+
+def sensor_stage(
+    name: str, summary: str, methods: Methods, role: StageRole = StageRole.SENSOR
+) -> Stage:
+    """Return a stage that is an effect of the sensor on the mosaic, see :class:`Stage`."""
+    return Stage(name, summary, Kind.MOSAIC, Kind.MOSAIC, methods, role=role)
+
+
+def rgb_stage(name: str, summary: str, methods: Methods, **options: Any) -> Stage:
+    """Return a stage that reads and writes linear RGB, see :class:`Stage`."""
+    return Stage(name, summary, Kind.RGB, Kind.RGB, methods, **options)

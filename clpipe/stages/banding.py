@@ -10,16 +10,14 @@ from clpipe.stage import (
     Arguments,
     Backend,
     Context,
-    Kind,
     LineTable,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     parameter,
+    sensor_stage,
 )
 
 SINE = tuple(map(np.float32, (42.058693, -76.705859, 81.605249, -41.341702, 6.2831853)))
@@ -99,11 +97,4 @@ class Sine(SignalMethod):
         return y + sine_of_turns(turns, backend.where) * n["amplitude"]
 
 
-STAGE = Stage(
-    "banding",
-    "Add a periodic wave over the rows.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Sine,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("banding", "Add a periodic wave over the rows.", (Sine,))

@@ -11,16 +11,14 @@ from clpipe.stage import (
     Backend,
     CompileTime,
     Context,
-    Kind,
     LineTable,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     parameter,
+    sensor_stage,
 )
 
 Bias = tuple[float, float, float, float]
@@ -111,11 +109,6 @@ class Offsets(SignalMethod):
         return y + backend.tiled(cell)
 
 
-STAGE = Stage(
-    "black_level_error",
-    "Add an error of the black level to each colour.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Offsets,),
-    role=StageRole.SENSOR,
+STAGE = sensor_stage(
+    "black_level_error", "Add an error of the black level to each colour.", (Offsets,)
 )

@@ -6,16 +6,14 @@ from clpipe.stage import (
     Arguments,
     Backend,
     Context,
-    Kind,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     Stencil,
     Unchanged,
     parameter,
+    sensor_stage,
 )
 
 RADIUS = 16  # px
@@ -78,11 +76,4 @@ class Column(SignalMethod):
         return backend.minimum(backend.minimum(y, full) + received, full)
 
 
-STAGE = Stage(
-    "blooming",
-    "Let charge overflow from full pixels.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (NoBlooming, Column),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("blooming", "Let charge overflow from full pixels.", (NoBlooming, Column))

@@ -11,14 +11,13 @@ from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
@@ -168,11 +167,9 @@ class CameraToSrgb(FixedMatrix):
         return self.with_defaults(matrix=as_tuples(inverse.tolist()))
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "color_matrix",
     "Convert the camera's colours to linear sRGB.",
-    Kind.RGB,
-    Kind.RGB,
     (AsShot, CameraToSrgb, FixedMatrix, NoMatrix),
     role=StageRole.COLOURS,
 )

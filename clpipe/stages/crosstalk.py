@@ -6,15 +6,13 @@ from clpipe.stage import (
     Arguments,
     Backend,
     Context,
-    Kind,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     Stencil,
     parameter,
+    sensor_stage,
 )
 
 
@@ -63,11 +61,4 @@ class Neighbours(SignalMethod):
         return y + ((across + down) - y * 4) * n["share"]
 
 
-STAGE = Stage(
-    "crosstalk",
-    "Let charge leak to neighbouring pixels.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Neighbours,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("crosstalk", "Let charge leak to neighbouring pixels.", (Neighbours,))

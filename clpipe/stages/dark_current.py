@@ -17,10 +17,9 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     parameter,
     sensor_bits,
+    sensor_stage,
 )
 
 
@@ -165,11 +164,6 @@ def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:
     return exponential_of(sensor_bits(height, width, stream)) - np.float32(1)
 
 
-STAGE = Stage(
-    "dark_current",
-    "Add the shot noise and fixed pattern of thermal charge.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Thermal,),
-    role=StageRole.SENSOR,
+STAGE = sensor_stage(
+    "dark_current", "Add the shot noise and fixed pattern of thermal charge.", (Thermal,)
 )

@@ -16,7 +16,6 @@ from clpipe.stage import (
     Backend,
     CompileTime,
     Context,
-    Kind,
     LineTable,
     Method,
     NoiseScope,
@@ -24,9 +23,8 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     parameter,
+    sensor_stage,
 )
 
 # Each product multiplies a curve over the rows by a curve over the columns. Each of the two maps
@@ -289,11 +287,4 @@ def sample_positions(pixels: int, per_px: np.float32, count: int) -> tuple[Array
     return first, np.minimum(first + 1, count - 1), t - first.astype(np.float32)
 
 
-STAGE = Stage(
-    "dark_shading",
-    "Add smooth dark shading maps of the sensor.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Smooth, File),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("dark_shading", "Add smooth dark shading maps of the sensor.", (Smooth, File))

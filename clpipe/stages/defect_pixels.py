@@ -10,16 +10,14 @@ from clpipe.stage import (
     Arguments,
     Backend,
     Context,
-    Kind,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     parameter,
     sensor_bits,
+    sensor_stage,
 )
 
 RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
@@ -112,11 +110,4 @@ def alive_pixels(height: int, width: int, stream: Stream, limit: int) -> Floats:
     return (sensor_bits(height, width, stream) <= limit).astype(np.float32)
 
 
-STAGE = Stage(
-    "defect_pixels",
-    "Make some pixels hot or dead.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Random,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("defect_pixels", "Make some pixels hot or dead.", (Random,))

@@ -15,15 +15,14 @@ from clpipe.stage import (
     Context,
     FocalLengthMethod,
     ImageLayer,
-    Kind,
     LayerMethod,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     Stencil,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 MAX_RADIUS = 31  # px, radius of a disc
@@ -249,11 +248,6 @@ class ThinLens(FocalLengthMethod, LayerMethod):
         return defocus(image, radii, taps)
 
 
-STAGE = Stage(
-    "defocus",
-    "Blur surfaces that are out of focus.",
-    Kind.RGB,
-    Kind.RGB,
-    (InFocus, ThinLens),
-    role=StageRole.LENS,
+STAGE = rgb_stage(
+    "defocus", "Blur surfaces that are out of focus.", (InFocus, ThinLens), role=StageRole.LENS
 )

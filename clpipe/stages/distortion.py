@@ -24,17 +24,16 @@ from clpipe.stage import (
     CompileTime,
     Context,
     FocalLengthMethod,
-    Kind,
     LensMethod,
     Method,
     Pass,
     PrincipalPointMethod,
     ReferenceContext,
     Resample,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 
@@ -303,11 +302,9 @@ class PtLens(LensfunDistortion):
         return Radial.of(1 - self.a - self.b - self.c, self.c, self.b, self.a)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "distortion",
     "Apply a lens's distortion and lateral colour.",
-    Kind.RGB,
-    Kind.RGB,
     (LensDistortion, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
     role=StageRole.LENS,
 )

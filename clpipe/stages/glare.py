@@ -8,16 +8,15 @@ from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     Method,
     Pass,
     Pointwise,
     Reduction,
     ReferenceContext,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 STEPS, MOST = np.float32(4096), np.float32(256)  # of a sample that is summed; per unit of light
@@ -88,11 +87,6 @@ def mean_light(image: Floats) -> Floats:
     return np.array(means, np.float32)
 
 
-STAGE = Stage(
-    "glare",
-    "Scatter light over the image, like a lens.",
-    Kind.RGB,
-    Kind.RGB,
-    (NoGlare, Veil),
-    role=StageRole.LENS,
+STAGE = rgb_stage(
+    "glare", "Scatter light over the image, like a lens.", (NoGlare, Veil), role=StageRole.LENS
 )

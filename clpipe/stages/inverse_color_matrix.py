@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 from pydantic import BeforeValidator
 
 from clpipe.camera.profile import IDENTITY, Matrix
-from clpipe.stage import Context, Kind, Stage, StageRole, parameter
+from clpipe.stage import Context, StageRole, parameter, rgb_stage
 from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, as_tuples
 
 
@@ -35,11 +35,9 @@ class SrgbToCamera(FixedMatrix):
         return self.with_defaults(matrix=as_tuples(context.camera.srgb_to_camera().tolist()))
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "inverse_color_matrix",
     "Convert linear sRGB to the camera's colours.",
-    Kind.RGB,
-    Kind.RGB,
     (SrgbToCamera, FixedMatrix, NoMatrix),
     role=StageRole.COLOURS_OF_LIGHT,
 )

@@ -14,17 +14,16 @@ from clpipe.stage import (
     Arguments,
     Context,
     FocalLengthMethod,
-    Kind,
     Method,
     Pass,
     PrincipalPointMethod,
     ReferenceContext,
     Resample,
-    Stage,
     StageRole,
     Stencil,
     parameter,
     pure,
+    rgb_stage,
 )
 
 MAX_LENGTH = 200.0  # px; the longest streak
@@ -227,11 +226,9 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
         return self.rotation_warp.reference(image) if self.rotation else image
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "motion_blur",
     "Blur by camera motion during the exposure.",
-    Kind.RGB,
-    Kind.RGB,
     (Linear, Perspective),
     role=StageRole.LENS,
 )

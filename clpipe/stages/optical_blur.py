@@ -20,12 +20,12 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     Stencil,
     Unchanged,
     parameter,
     pure,
+    rgb_stage,
 )
 from clpipe.stages.vignetting import relative_radius
 
@@ -357,11 +357,9 @@ class NoBlur(Unchanged):
     summary: ClassVar = "no blur"
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "optical_blur",
     "Blur by the lens and by the filter before the sensor.",
-    Kind.RGB,
-    Kind.RGB,
     (Lens, NoBlur),
     role=StageRole.LENS,
 )

@@ -9,15 +9,13 @@ from clpipe.stage import (
     Backend,
     Context,
     GaussianNoise,
-    Kind,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
-    Stage,
-    StageRole,
     parameter,
     sensor_normals,
+    sensor_stage,
 )
 
 
@@ -59,11 +57,4 @@ class Gaussian(GaussianNoise):
         return y * (backend.fixed(sensor_normals) * n["sigma"] + 1)
 
 
-STAGE = Stage(
-    "prnu",
-    "Vary the sensitivity of pixels (PRNU).",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Gaussian,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("prnu", "Vary the sensitivity of pixels (PRNU).", (Gaussian,))

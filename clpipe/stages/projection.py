@@ -19,16 +19,15 @@ from clpipe.reference.wide import WideLens
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
     Resample,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
     principal_point_parameter,
+    rgb_stage,
 )
 from clpipe.stages.distortion import filter_arguments
 
@@ -267,11 +266,9 @@ METHODS: tuple[type[Method], ...] = (
     FTheta,
 )
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "projection",
     "Make a wide-angle image from a render of the whole surroundings.",
-    Kind.RGB,
-    Kind.RGB,
     METHODS,
     role=StageRole.VIEW,
 )

@@ -7,13 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.reference.companding import (
-    Knots,
-    apply_pieces,
-    default_knots,
-    parse_knots,
-    pieces_of,
-)
+from clpipe.reference.companding import Knots, apply_pieces, default_knots, parse_knots, pieces_of
 from clpipe.stage import (
     Arguments,
     Backend,

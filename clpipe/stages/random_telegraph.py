@@ -16,10 +16,9 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     parameter,
     sensor_bits,
+    sensor_stage,
 )
 
 RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
@@ -102,11 +101,8 @@ def levels_of_sensor(height: int, width: int, stream: Stream, share: float) -> F
     return np.where(bits < limit, exponential_of(bits, limit), np.float32(0))
 
 
-STAGE = Stage(
+STAGE = sensor_stage(
     "random_telegraph",
     "Add random telegraph noise: some pixels jump between two levels.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
     (TwoLevels,),
-    role=StageRole.SENSOR,
 )

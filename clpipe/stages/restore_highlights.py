@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stage import Arguments, Context, Pass, ReferenceContext, rgb_stage
 from clpipe.stages.white_balance.gains import CameraGains, gain_parameter
 
 
@@ -55,10 +55,8 @@ class Brooks2019(CameraGains):
         return np.stack([raised[0], green, raised[1]], axis=-1)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "restore_highlights",
     "Restore red and blue in the clipped highlights of a photograph.",
-    Kind.RGB,
-    Kind.RGB,
     (Brooks2019,),
 )

@@ -17,11 +17,11 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     Stencil,
     Unchanged,
     parameter,
     pure,
+    rgb_stage,
 )
 from clpipe.stages.denoise.strength import (
     MID_GREY,
@@ -170,10 +170,4 @@ class NoSharpening(Unchanged):
     summary: ClassVar = "no sharpening"
 
 
-STAGE = Stage(
-    "sharpen",
-    "Sharpen luma, like a camera.",
-    Kind.RGB,
-    Kind.RGB,
-    (Unsharp, NoSharpening),
-)
+STAGE = rgb_stage("sharpen", "Sharpen luma, like a camera.", (Unsharp, NoSharpening))

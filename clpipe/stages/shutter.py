@@ -11,15 +11,14 @@ from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     LineTable,
     Method,
     Pass,
     ReferenceContext,
     Span,
-    Stage,
     StageRole,
     parameter,
+    rgb_stage,
     typed_arguments,
 )
 
@@ -280,11 +279,9 @@ def _phase_word(cycles: float) -> np.uint32:
     return np.uint32(round(cycles % 1 * 2**32) % 2**32)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "shutter",
     "Expose with a rolling shutter and flickering light.",
-    Kind.RGB,
-    Kind.RGB,
     (Rows,),
     role=StageRole.SHUTTER,
 )

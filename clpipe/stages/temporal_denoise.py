@@ -15,15 +15,14 @@ from clpipe.stage import (
     CompileTime,
     Context,
     ImageLayer,
-    Kind,
     LayerMethod,
     Method,
     Noiseless,
     Pass,
     ReferenceContext,
-    Stage,
     Stencil,
     parameter,
+    rgb_stage,
     typed_arguments,
 )
 from clpipe.stages.denoise.strength import noise_of_colours
@@ -265,10 +264,8 @@ def best_match(
     return best, sums, before
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "temporal_denoise",
     "Reduce noise with the frames before, in a sequence.",
-    Kind.RGB,
-    Kind.RGB,
     (Recursive, BlockMatching, OpticalFlow),
 )

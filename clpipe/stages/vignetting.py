@@ -13,16 +13,15 @@ from clpipe.stage import (
     CompileTime,
     Context,
     FocalLengthMethod,
-    Kind,
     LensMethod,
     Method,
     Pass,
     PrincipalPointMethod,
     ReferenceContext,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 Coefficient = Annotated[float, Field(ge=-100, le=100)]
@@ -170,11 +169,9 @@ def _reciprocal(x: Floats) -> Floats:
     return root * root
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "vignetting",
     "Darken the corners of the image, like a lens.",
-    Kind.RGB,
-    Kind.RGB,
     (LensVignetting, NoVignetting, Pa, CosineFourth),
     role=StageRole.FALLOFF,
 )

@@ -11,13 +11,12 @@ from clpipe.stage import (
     Arguments,
     Context,
     Curve,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     parameter,
+    rgb_stage,
 )
 from clpipe.stages.tone_curve.neutral import Neutral
 from clpipe.stages.tone_curve.standard import Standard
@@ -96,11 +95,9 @@ class File(Curve):
         return self.read(self.path)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "tone_curve",
     "Apply a tone curve with the contrast of a photograph.",
-    Kind.RGB,
-    Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),
     role=StageRole.RESPONSE,
 )
