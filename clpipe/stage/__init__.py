@@ -26,7 +26,16 @@ from clpipe.stage.bases import (
 )
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ImageLayer, ReferenceContext
-from clpipe.stage.method import Method, Stage, StageRole, parameter, rgb_stage, sensor_stage
+from clpipe.stage.method import (
+    Method,
+    Stage,
+    StageRole,
+    camera_parameter,
+    optics_parameter,
+    parameter,
+    rgb_stage,
+    sensor_stage,
+)
 from clpipe.stage.passes import (
     PREVIOUS,
     Argument,
@@ -83,8 +92,10 @@ __all__ = [
     "TableLookup",
     "Unchanged",
     "bytes_of",
+    "camera_parameter",
     "levels_table",
     "odd_size",
+    "optics_parameter",
     "parameter",
     "period_of",
     "principal_point_parameter",

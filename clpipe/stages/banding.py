@@ -7,7 +7,6 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.stage import (
-    Arguments,
     Backend,
     Context,
     LineTable,
@@ -16,7 +15,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    parameter,
+    camera_parameter,
     sensor_stage,
 )
 
@@ -58,11 +57,11 @@ class Sine(SignalMethod):
     summary: ClassVar = "add a sine wave over the rows, with a new phase in each image"
     example: ClassVar = {"amplitude": 0.01, "period": 9.7}
 
-    amplitude: float | None = parameter(
-        None, "Amplitude of the wave.", "signal", "from the camera and ISO", ge=0, le=1
+    amplitude: float | None = camera_parameter(
+        "Amplitude of the wave.", "signal", more=" and ISO", ge=0, le=1
     )
-    period: float | None = parameter(
-        None, "Period of the wave.", "rows", "from the camera; else 16", ge=2, le=1e5
+    period: float | None = camera_parameter(
+        "Period of the wave.", "rows", more="; else 16", ge=2, le=1e5
     )
 
     def resolve(self, context: Context) -> "Sine":
@@ -84,9 +83,6 @@ class Sine(SignalMethod):
         """The frequency of the wave, in turns per row."""
         assert self.period is not None
         return 1 / self.period
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"frequency": self.frequency, "amplitude": self.amplitude}
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         return input_variance + np.float32(self.amplitude) ** 2 / np.float32(2)

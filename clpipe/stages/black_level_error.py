@@ -17,6 +17,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
+    camera_parameter,
     parameter,
     sensor_stage,
 )
@@ -46,19 +47,17 @@ class Offsets(SignalMethod):
     )
     example: ClassVar = {"sigma": 0.01, "bias": [0.004, -0.002, 0.001, 0.003]}
 
-    sigma: float | None = parameter(
-        None,
+    sigma: float | None = camera_parameter(
         "Standard deviation of the offsets that change with each image.",
         "signal",
-        "from the camera and ISO",
+        more=" and ISO",
         ge=0,
         le=1,
     )
-    bias: Annotated[Bias, Field(strict=False)] | None = parameter(
-        None,
+    bias: Annotated[Bias, Field(strict=False)] | None = camera_parameter(
         "Fixed offsets of R, of G in the rows of R, of G in the rows of B, and of B.",
         "signal",
-        "from the camera and ISO",
+        more=" and ISO",
     )
 
     offset: float = parameter(0.0, "Offset of all colours.", "signal", ge=-1, le=1)

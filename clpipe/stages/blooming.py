@@ -12,6 +12,7 @@ from clpipe.stage import (
     SignalMethod,
     Stencil,
     Unchanged,
+    camera_parameter,
     parameter,
     sensor_stage,
 )
@@ -22,7 +23,6 @@ RADIUS = 16  # px
 class NoBlooming(Unchanged):
     """No blooming, for sensors that drain excess charge."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no blooming, for sensors that drain excess charge"
 
 
@@ -45,8 +45,8 @@ class Column(SignalMethod):
     summary: ClassVar = "charge above the full well flows along the column"
     example: ClassVar = {"full_signal": 0.4, "spill": 0.7}
 
-    full_signal: float | None = parameter(
-        None, "Signal of a full pixel.", "signal", "from the camera and ISO; else 1", gt=0, le=1e6
+    full_signal: float | None = camera_parameter(
+        "Signal of a full pixel.", "signal", more=" and ISO; else 1", gt=0, le=1e6
     )
     spill: float = parameter(
         0.7, "Share of the excess charge that each pixel passes on to the next one.", ge=0, lt=1

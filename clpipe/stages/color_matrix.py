@@ -16,6 +16,7 @@ from clpipe.stage import (
     ReferenceContext,
     StageRole,
     Unchanged,
+    camera_parameter,
     parameter,
     rgb_stage,
 )
@@ -64,7 +65,6 @@ def srgb_to_camera(camera: Camera) -> Doubles:
 class NoMatrix(Unchanged):
     """No matrix: colours do not change."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no matrix: colours do not change"
 
 
@@ -143,10 +143,8 @@ class CameraToSrgb(FixedMatrix):
     summary: ClassVar = "camera RGB to linear sRGB, for raw files of a camera"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from camera RGB to linear sRGB.",
-        auto="from the camera",
+    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = camera_parameter(
+        "Three rows of three numbers, from camera RGB to linear sRGB."
     )
 
     def resolve(self, context: Context) -> "CameraToSrgb":

@@ -3,7 +3,6 @@
 from typing import ClassVar
 
 from clpipe.stage import (
-    Arguments,
     Backend,
     Context,
     Numbers,
@@ -11,7 +10,7 @@ from clpipe.stage import (
     Signal,
     SignalMethod,
     Stencil,
-    parameter,
+    camera_parameter,
     sensor_stage,
 )
 
@@ -36,13 +35,8 @@ class Neighbours(SignalMethod):
     summary: ClassVar = "give a share of each pixel's charge to its four neighbours"
     example: ClassVar = {"share": 0.02}
 
-    share: float | None = parameter(
-        None,
-        "Share of a pixel's charge that leaks to each of its four neighbours.",
-        "",
-        "from the camera",
-        ge=0,
-        le=0.2,
+    share: float | None = camera_parameter(
+        "Share of a pixel's charge that leaks to each of its four neighbours.", ge=0, le=0.2
     )
 
     def resolve(self, context: Context) -> "Neighbours":
@@ -50,9 +44,6 @@ class Neighbours(SignalMethod):
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("crosstalk", Stencil(1), ("share",)),) if self.share else ()
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"share": self.share}
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -17,6 +17,8 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
+    camera_parameter,
+    optics_parameter,
     parameter,
     sensor_bits,
     sensor_stage,
@@ -43,12 +45,10 @@ class Thermal(SignalMethod):
     summary: ClassVar = "add the shot noise and the fixed pattern of dark current"
     example: ClassVar = {"exposure_time": 30.0, "current": 3.0, "spread": 0.4, "per_electron": 4e-4}
 
-    exposure_time: float | None = parameter(
-        None,
+    exposure_time: float | None = optics_parameter(
         "Exposure time. 0 disables dark current.",
         "s",
-        "the camera's, from the exposure's EV; else 0",
-        optics=True,
+        more=", from the exposure's EV; else 0",
         ge=0,
         le=86400,
     )
@@ -60,36 +60,25 @@ class Thermal(SignalMethod):
         ge=-150,
         le=150,
     )
-    current: float | None = parameter(
-        None, "Dark current at the reference temperature.", "e-/s", "from the camera", ge=0, le=1e6
+    current: float | None = camera_parameter(
+        "Dark current at the reference temperature.", "e-/s", ge=0, le=1e6
     )
-    reference_temperature: float | None = parameter(
-        None,
-        "Reference temperature, at which the current was measured.",
-        "deg C",
-        "from the camera",
-        ge=-150,
-        le=150,
+    reference_temperature: float | None = camera_parameter(
+        "Reference temperature, at which the current was measured.", "deg C", ge=-150, le=150
     )
-    doubling: float | None = parameter(
-        None,
+    doubling: float | None = camera_parameter(
         "Temperature difference that doubles the current. With 0 it does not depend on "
         "temperature.",
         "K",
-        "from the camera; else 0",
+        more="; else 0",
         ge=0,
         le=1000,
     )
-    spread: float | None = parameter(
-        None,
-        "Variation between pixels: standard deviation over mean.",
-        "",
-        "from the camera",
-        ge=0,
-        le=1,
+    spread: float | None = camera_parameter(
+        "Variation between pixels: standard deviation over mean.", ge=0, le=1
     )
-    per_electron: float | None = parameter(
-        None, "Signal of one electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
+    per_electron: float | None = camera_parameter(
+        "Signal of one electron.", "signal/e-", more=" and ISO", gt=0, le=1
     )
 
     def optics(self) -> Mapping[str, float]:

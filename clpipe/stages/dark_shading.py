@@ -23,6 +23,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
+    camera_parameter,
     parameter,
     sensor_stage,
 )
@@ -85,19 +86,14 @@ class Smooth(SignalMethod):
     )
     example: ClassVar = {"slope": 1e-5, "offset": 0.01, "length": 7.3}
 
-    slope: float | None = parameter(
-        None,
-        "Standard deviation of the map k.",
-        "signal per ISO",
-        "from the camera",
-        ge=0,
-        le=1,
+    slope: float | None = camera_parameter(
+        "Standard deviation of the map k.", "signal per ISO", ge=0, le=1
     )
-    offset: float | None = parameter(
-        None, "Standard deviation of the map b.", "signal", "from the camera", ge=0, le=1
+    offset: float | None = camera_parameter(
+        "Standard deviation of the map b.", "signal", ge=0, le=1
     )
-    length: float | None = parameter(
-        None, "Distance between the knots of the maps.", "px", "from the camera", ge=4, le=1e5
+    length: float | None = camera_parameter(
+        "Distance between the knots of the maps.", "px", ge=4, le=1e5
     )
 
     def resolve(self, context: Context) -> "Smooth":
@@ -213,8 +209,8 @@ class File(SignalMethod):
     )
     offset_file: str | None = parameter(None, "Image of the map b, in DN.", "", "none", file=True)
     block: float = parameter(32.0, "Distance between the samples of the maps.", "px", ge=1, le=4096)
-    unit: float | None = parameter(
-        None, "DN that correspond to a signal of 1.", "DN", "from the camera", gt=0, le=1e6
+    unit: float | None = camera_parameter(
+        "DN that correspond to a signal of 1.", "DN", gt=0, le=1e6
     )
 
     @field_validator("slope_file", "offset_file")

@@ -15,7 +15,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    parameter,
+    camera_parameter,
     sensor_bits,
     sensor_stage,
 )
@@ -44,19 +44,14 @@ class Random(SignalMethod):
     summary: ClassVar = "make pixels at random positions of the sensor hot or dead"
     example: ClassVar = {"hot_share": 0.05, "hot_level": 0.3, "dead_share": 0.05}
 
-    hot_share: float | None = parameter(
-        None, "Share of the pixels that are hot.", "", "from the camera", ge=0, le=0.1
-    )
-    hot_level: float | None = parameter(
-        None,
+    hot_share: float | None = camera_parameter("Share of the pixels that are hot.", ge=0, le=0.1)
+    hot_level: float | None = camera_parameter(
         "Smallest extra signal of a hot pixel; the mean is twice as large.",
         "signal",
-        "from the camera and ISO; else 0.1",
+        more=" and ISO; else 0.1",
         ge=0,
     )
-    dead_share: float | None = parameter(
-        None, "Share of the pixels that are dead.", "", "from the camera", ge=0, le=0.1
-    )
+    dead_share: float | None = camera_parameter("Share of the pixels that are dead.", ge=0, le=0.1)
 
     def resolve(self, context: Context) -> "Random":
         camera = context.camera

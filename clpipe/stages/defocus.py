@@ -21,6 +21,7 @@ from clpipe.stage import (
     StageRole,
     Stencil,
     Unchanged,
+    optics_parameter,
     parameter,
     rgb_stage,
 )
@@ -32,7 +33,6 @@ NO_SURFACE = ImageLayer("depth", np.full((1, 1), np.inf, np.float32))
 class InFocus(Unchanged):
     """No depth of field: everything is in focus."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "everything is in focus"
 
 
@@ -59,17 +59,11 @@ class ThinLens(FocalLengthMethod, LayerMethod):
     usual_layers: ClassVar = ("Depth", "Z", "ZDepth", "Distance")
     no_layer: ClassVar = NO_SURFACE
 
-    focal_length: float | None = parameter(
-        None,
-        "Focal length.",
-        "mm",
-        "the camera's, else from fx and the pixel pitch, else 50",
-        optics=True,
-        gt=0,
-        le=2000,
+    focal_length: float | None = optics_parameter(
+        "Focal length.", "mm", more=", else from fx and the pixel pitch, else 50", gt=0, le=2000
     )
-    f_number: float | None = parameter(
-        None, "f-number of the aperture.", "", "the camera's, else 2.8", optics=True, ge=0.5, le=64
+    f_number: float | None = optics_parameter(
+        "f-number of the aperture.", more=", else 2.8", ge=0.5, le=64
     )
     focus_distance: float | None = parameter(
         None,

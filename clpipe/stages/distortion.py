@@ -40,7 +40,6 @@ from clpipe.stage import (
 class NoDistortion(Unchanged):
     """No distortion."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no distortion"
 
 

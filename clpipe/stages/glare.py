@@ -25,7 +25,6 @@ STEPS, MOST = np.float32(4096), np.float32(256)  # of a sample that is summed; p
 class NoGlare(Unchanged):
     """No glare."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no glare"
 
 

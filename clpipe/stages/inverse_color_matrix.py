@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 from pydantic import BeforeValidator
 
 from clpipe.camera.profile import IDENTITY, Matrix
-from clpipe.stage import Context, StageRole, parameter, rgb_stage
+from clpipe.stage import Context, StageRole, camera_parameter, rgb_stage
 from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, as_tuples
 
 
@@ -21,10 +21,8 @@ class SrgbToCamera(FixedMatrix):
     summary: ClassVar = "linear sRGB to camera RGB, if the camera's matrix is known"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from linear sRGB to camera RGB.",
-        auto="from the camera; else none",
+    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = camera_parameter(
+        "Three rows of three numbers, from linear sRGB to camera RGB.", more="; else none"
     )
 
     def resolve(self, context: Context) -> "SrgbToCamera":

@@ -106,32 +106,25 @@ class NonLocalMeans(Method):
             Pass("with_gains", arguments=("pattern", "red_gain", "blue_gain"), reads=("filtered",)),
         )
 
-    def numbers(self, context: Context) -> Arguments:
-        """Return the run-time arguments of all passes, by name."""
+    def arguments(self, context: Context) -> Arguments:
         assert self.a is not None and self.b is not None
         red, blue = context.applied_gains
         offset = max(0.375 * self.a**2 + self.b, 1e-12)
         return {
+            **super().arguments(context),
+            "reach": CompileTime(str(self.reach)),
             "red_inverse": 1 / red,
             "blue_inverse": 1 / blue,
             "red_gain": red,
             "blue_gain": blue,
-            "a": self.a,
             "offset": offset,
             "root_of_offset": np.sqrt(offset),
             "bias": bias_of(self.strength),
             "scale": decay_of(FACTOR * self.strength),
         }
 
-    def arguments(self, context: Context) -> Arguments:
-        return {
-            "pattern": context.cfa,
-            "reach": CompileTime(str(self.reach)),
-            **self.numbers(context),
-        }
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        n = typed_arguments(self.numbers(inputs.context))
+        n = typed_arguments(self.arguments(inputs.context))
         shape, pattern = image.shape, inputs.context.pattern
         one = np.float32(1)
         sensor = image * by_site(shape, pattern, n["red_inverse"], one, n["blue_inverse"])

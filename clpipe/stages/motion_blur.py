@@ -21,6 +21,7 @@ from clpipe.stage import (
     Resample,
     StageRole,
     Stencil,
+    optics_parameter,
     parameter,
     pure,
     rgb_stage,
@@ -98,14 +99,8 @@ class Linear(Method):
         ge=0,
         lt=45,
     )
-    fx: float | None = parameter(
-        None,
-        "Focal length, for the streak of a rotation.",
-        "px",
-        "the camera's",
-        optics=True,
-        gt=0,
-        le=1e6,
+    fx: float | None = optics_parameter(
+        "Focal length, for the streak of a rotation.", "px", gt=0, le=1e6
     )
 
     @model_validator(mode="after")

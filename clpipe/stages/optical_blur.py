@@ -353,7 +353,6 @@ class Lens(Method):
 class NoBlur(Unchanged):
     """No blur: the image keeps the sharpness of the render."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no blur"
 
 

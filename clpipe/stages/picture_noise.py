@@ -68,7 +68,6 @@ class NoiseMatching(Method):
 class NoNoise(Unchanged, NoiseMatching):
     """No noise on the finished image; with ``clpipe run --truth iid``, how to match the noise."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no noise on the finished image"
 
     jpeg: bool = parameter(

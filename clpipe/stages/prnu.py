@@ -13,7 +13,7 @@ from clpipe.stage import (
     Numbers,
     Pass,
     Signal,
-    parameter,
+    camera_parameter,
     sensor_normals,
     sensor_stage,
 )
@@ -33,13 +33,8 @@ class Gaussian(GaussianNoise):
     kernel: ClassVar = "prnu"
     summary: ClassVar = "multiply each pixel by a sensitivity, the same in every image of a camera"
 
-    sigma: float | None = parameter(
-        None,
-        "Standard deviation of the sensitivities; their mean is 1.",
-        "",
-        "from the camera",
-        ge=0,
-        le=0.5,
+    sigma: float | None = camera_parameter(
+        "Standard deviation of the sensitivities; their mean is 1.", ge=0, le=0.5
     )
 
     def resolve(self, context: Context) -> "Gaussian":

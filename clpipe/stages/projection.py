@@ -35,7 +35,6 @@ from clpipe.stages.distortion import filter_arguments
 class NoProjection(Unchanged):
     """The image keeps the render's perspective."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "keep the render's perspective"
 
 

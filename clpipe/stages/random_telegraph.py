@@ -16,7 +16,7 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    parameter,
+    camera_parameter,
     sensor_bits,
     sensor_stage,
 )
@@ -45,16 +45,9 @@ class TwoLevels(SignalMethod):
     summary: ClassVar = "a share of the pixels jumps between two levels"
     example: ClassVar = {"share": 0.05, "amplitude": 0.05}
 
-    share: float | None = parameter(
-        None, "Share of the pixels that jump.", "", "from the camera", ge=0, le=0.1
-    )
-    amplitude: float | None = parameter(
-        None,
-        "Mean distance between the two levels.",
-        "signal",
-        "from the camera and ISO",
-        ge=0,
-        le=1,
+    share: float | None = camera_parameter("Share of the pixels that jump.", ge=0, le=0.1)
+    amplitude: float | None = camera_parameter(
+        "Mean distance between the two levels.", "signal", more=" and ISO", ge=0, le=1
     )
 
     def resolve(self, context: Context) -> "TwoLevels":

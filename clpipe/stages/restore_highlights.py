@@ -5,7 +5,7 @@ from typing import ClassVar
 import numpy as np
 
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Pass, ReferenceContext, rgb_stage
+from clpipe.stage import Context, Pass, ReferenceContext, rgb_stage
 from clpipe.stages.white_balance.gains import CameraGains, gain_parameter
 
 
@@ -37,10 +37,6 @@ class Brooks2019(CameraGains):
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
-
-    def arguments(self, context: Context) -> Arguments:
-        red, blue = self.gains
-        return {"red_gain": red, "blue_gain": blue}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         one = np.float32(1)

@@ -129,15 +129,9 @@ class Unsharp(Method):
         )
 
     def arguments(self, context: Context) -> Arguments:
-        return {
-            "reach": CompileTime(str(self.reach)),
-            "step": CompileTime(str(blur_step(self.radius))),
-            "weights": blur_weights(self.radius),
-            "amount": self.amount,
-            "threshold": self.threshold,
-            "limit": self.limit,
-            "offset": self.offset,
-        }
+        reach, step = (CompileTime(str(n)) for n in (self.reach, blur_step(self.radius)))
+        weights = blur_weights(self.radius)
+        return {**super().arguments(context), "reach": reach, "step": step, "weights": weights}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.amount:
@@ -166,7 +160,6 @@ def _blurred_along(plane: Floats, radius: float, step: tuple[int, int]) -> Float
 class NoSharpening(Unchanged):
     """No sharpening."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no sharpening"
 
 

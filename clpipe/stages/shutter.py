@@ -17,6 +17,7 @@ from clpipe.stage import (
     ReferenceContext,
     Span,
     StageRole,
+    optics_parameter,
     parameter,
     rgb_stage,
     typed_arguments,
@@ -64,14 +65,8 @@ class Rows(Method):
         ge=1,
         le=10_000,
     )
-    exposure_time: float | None = parameter(
-        None,
-        "Exposure time of each row.",
-        "s",
-        "the camera's, else 0.01",
-        optics=True,
-        gt=0,
-        le=3600,
+    exposure_time: float | None = optics_parameter(
+        "Exposure time of each row.", "s", more=", else 0.01", gt=0, le=3600
     )
     line_time: float = parameter(
         0.0,

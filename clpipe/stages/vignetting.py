@@ -30,7 +30,6 @@ Coefficient = Annotated[float, Field(ge=-100, le=100)]
 class NoVignetting(Unchanged):
     """No vignetting."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no vignetting"
 
 
@@ -73,9 +72,6 @@ class Pa(Method):
         if self.k1 == self.k2 == self.k3 == 0:
             return ()
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"extent": CompileTime("e"), "k1": self.k1, "k2": self.k2, "k3": self.k3}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         r2 = relative_radius(image)

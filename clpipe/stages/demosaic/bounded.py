@@ -161,12 +161,8 @@ class Bounded(Method):
         )
 
     def arguments(self, context: Context) -> Arguments:
-        return {
-            "pattern": context.cfa,
-            "even": EQUAL_GRADIENT,
-            "noise": self.noise_margin,
-            "offset": self.offset,
-        }
+        known = super().arguments(context)
+        return {**known, "even": EQUAL_GRADIENT, "noise": self.noise_margin}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         pattern, offset = inputs.context.pattern, np.float32(self.offset)

@@ -73,9 +73,10 @@ class Bilateral(WindowDenoiser):
         luma, chroma = (f"{self.range * amount:.3g}" for amount in self.amounts)
         return f"range sigma = {self.range:g} * strength * noise: luma {luma}, chroma {chroma}"
 
-    def numbers(self, context: Context) -> Arguments:
+    def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.amounts
         return {
+            **super().arguments(context),
             "spatial_scale": gaussian_scale(self.spatial_sigma),
             "luma_scale": gaussian_scale(self.range * luma),
             "chroma_scale": gaussian_scale(self.range * chroma),
@@ -83,7 +84,7 @@ class Bilateral(WindowDenoiser):
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
-        numbers = typed_arguments(self.numbers(inputs.context))
+        numbers = typed_arguments(self.arguments(inputs.context))
         luma, chroma = planes[..., :1], planes[..., 1:]
         near = numbers["spatial_scale"]
         guide = smooth(planes) if self.guide == "smooth" else planes

@@ -43,9 +43,13 @@ class BlendedFilter(WindowDenoiser):
         formula = f"share = s^2 / (s^2 + {DETAIL:g}^2), s = strength * noise"
         return f"{formula}: luma {luma}, chroma {chroma}"
 
-    def numbers(self, context: Context) -> Arguments:
+    def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.amounts
-        return {"luma_share": blend_share(luma), "chroma_share": blend_share(chroma)}
+        return {
+            **super().arguments(context),
+            "luma_share": blend_share(luma),
+            "chroma_share": blend_share(chroma),
+        }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)

@@ -66,7 +66,7 @@ class NonLocalMeans(WindowDenoiser):
         luma, chroma = (f"{FACTOR * amount:.3g}" for amount in self.amounts)
         return f"h = {FACTOR:g} * strength * noise: luma {luma}, chroma {chroma}"
 
-    def numbers(self, context: Context) -> Arguments:
+    def arguments(self, context: Context) -> Arguments:
         assert self.luma_noise is not None and self.chroma_noise is not None
         # The squared distance of two patches is the mean of d^2 / sigma^2 over luma, chroma and the
         # patch. In these units it is a plain sum of squares.
@@ -77,6 +77,7 @@ class NonLocalMeans(WindowDenoiser):
         at_grey = variance.at(MID_GREY)
         slope, offset = variance.slope / at_grey, variance.offset / at_grey
         return {
+            **super().arguments(context),
             "luma_unit": luma_unit,
             "chroma_unit": chroma_unit,
             "noise_slope": slope * luma_unit / PATCH,
@@ -88,7 +89,7 @@ class NonLocalMeans(WindowDenoiser):
         }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        n = typed_arguments(self.numbers(inputs.context))
+        n = typed_arguments(self.arguments(inputs.context))
         units = np.array([n["luma_unit"], n["chroma_unit"], n["chroma_unit"]], np.float32)
         planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))

@@ -207,10 +207,6 @@ class WindowDenoiser(Denoiser):
         """The largest offsets in the windows of luma and chroma, px."""
         return self.luma_size // 2, self.chroma_size // 2
 
-    def numbers(self, context: Context) -> Arguments:
-        """Return the run-time arguments of all passes, by name."""
-        raise NotImplementedError(type(self).__name__)
-
     def passes(self) -> tuple[Pass, ...]:
         return (
             self.first_pass,
@@ -227,5 +223,4 @@ class WindowDenoiser(Denoiser):
 
     def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.reaches
-        reaches = {"luma_reach": CompileTime(str(luma)), "chroma_reach": CompileTime(str(chroma))}
-        return {**reaches, **self.numbers(context)}
+        return {"luma_reach": CompileTime(str(luma)), "chroma_reach": CompileTime(str(chroma))}

@@ -4,7 +4,7 @@ import math
 from typing import ClassVar, Self
 
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
-from clpipe.stage import Context, parameter
+from clpipe.stage import Context, optics_parameter, parameter
 from clpipe.stages.exposure.gain import Gain
 
 SATURATION = 78.0  # lx s at ISO 1; the exposure that saturates the sensor
@@ -41,11 +41,11 @@ class Photometric(Gain):
         ge=0,
         le=10,
     )
-    exposure_time: float | None = parameter(
-        None, "Exposure time, t.", "s", "the camera's, else 0.01", optics=True, gt=0, le=86400
+    exposure_time: float | None = optics_parameter(
+        "Exposure time, t.", "s", more=", else 0.01", gt=0, le=86400
     )
-    f_number: float | None = parameter(
-        None, "f-number of the lens, N.", "", "the camera's, else 8", optics=True, gt=0, le=1000
+    f_number: float | None = optics_parameter(
+        "f-number of the lens, N.", more=", else 8", gt=0, le=1000
     )
     q: float = parameter(
         0.65, "Share of the light that the lens and its geometry pass.", gt=0, le=math.pi / 4

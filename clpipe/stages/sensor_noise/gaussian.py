@@ -42,7 +42,7 @@ class Gaussian(SensorNoise):
             return np.maximum(self.added_variance(signal), np.float32(0)) + input_variance
         return super().variance(input_variance, signal, context)
 
-    def numbers(self) -> Arguments:
+    def arguments(self, context: Context) -> Arguments:
         full = or_default(self.full_signal, NEVER_FULL)
         numbers = {"a": self.a, "full_well": full}
         if self.tukey_lambda is None:

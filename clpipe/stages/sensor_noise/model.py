@@ -18,6 +18,7 @@ from clpipe.stage import (
     Numbers,
     Signal,
     SignalMethod,
+    camera_parameter,
     parameter,
 )
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
@@ -92,18 +93,12 @@ class SensorNoise(SignalMethod):
     p0: float | None = parameter(
         None, "With chi: the pedestal (Bielova et al. 2019).", "signal", "not used", ge=0
     )
-    full_well: float | None = parameter(
-        None,
-        "Largest number of electrons that a pixel holds.",
-        "e-",
-        "from the camera; else no limit",
-        gt=0,
+    full_well: float | None = camera_parameter(
+        "Largest number of electrons that a pixel holds.", "e-", more="; else no limit", gt=0
     )
-    tukey_lambda: float | None = parameter(
-        None,
+    tukey_lambda: float | None = camera_parameter(
         "Shape of the read noise: 0.14 is nearly Gaussian, and lower values have heavier tails.",
-        "",
-        "from the camera; else Gaussian",
+        more="; else Gaussian",
         gt=-0.5,
         le=1,
     )
@@ -191,13 +186,6 @@ class SensorNoise(SignalMethod):
         """The variance of this stage's noise, a*y + b, y at most the full well; signal squared."""
         y = np.minimum(signal, np.float32(or_default(self.full_signal, NEVER_FULL)))
         return y * np.float32(self.a) + np.float32(self.b)
-
-    def numbers(self) -> Arguments:
-        """Return the kernel's arguments, by name."""
-        raise NotImplementedError(type(self).__name__)
-
-    def arguments(self, context: Context) -> Arguments:
-        return self.numbers()
 
     def read_noise_numbers(self) -> Arguments:
         """Return the kernel's arguments for read noise: sigma and, if not Gaussian, its shape."""

@@ -49,7 +49,7 @@ class Poisson(SensorNoise):
             ),
         )
 
-    def numbers(self) -> Arguments:
+    def arguments(self, context: Context) -> Arguments:
         assert self.a
         return {
             "chi": 1 / self.a,

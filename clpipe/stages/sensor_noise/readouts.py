@@ -19,6 +19,7 @@ from clpipe.stage import (
     NoiseScope,
     Pass,
     ReferenceContext,
+    camera_parameter,
     parameter,
     typed_arguments,
 )
@@ -69,17 +70,15 @@ class Readouts(SensorNoise):
 
     kernel: ClassVar = "sensor_noise_readouts"
 
-    ratio: float | None = parameter(
-        None,
+    ratio: float | None = camera_parameter(
         "Ratio of sensitivity between each readout and the next one.",
-        auto="from the camera; else 16",
+        more="; else 16",
         gt=1,
         le=1024,
     )
-    later_noise: float | None = parameter(
-        None,
+    later_noise: float | None = camera_parameter(
         "Read noise of the further readouts over that of the first, both in DN.",
-        auto="from the camera; else 1",
+        more="; else 1",
         ge=0,
         le=1000,
     )
@@ -157,14 +156,6 @@ class Readouts(SensorNoise):
     def full_signal(self) -> float | None:
         return self._full_signal if self._is_clean else super().full_signal
 
-    def numbers(self) -> Arguments:
-        return {
-            "a": self.a,
-            "full_well": or_default(self.full_signal, NEVER_FULL),
-            "range": self._signal_range,
-            "unit": 1 / self._signal_range,
-        }
-
     @property
     def table(self) -> Floats:
         """The readouts in the layout of the kernel: (readout, 5)."""
@@ -174,7 +165,14 @@ class Readouts(SensorNoise):
     def arguments(self, context: Context) -> Arguments:
         structure = {"count": len(self.readouts), "part": -1 if self.part is None else self.part}
         literals = {name: CompileTime(str(value)) for name, value in structure.items()}
-        return {**self.numbers(), **literals, "table": self.table}
+        return {
+            **literals,
+            "a": self.a,
+            "full_well": or_default(self.full_signal, NEVER_FULL),
+            "range": self._signal_range,
+            "unit": 1 / self._signal_range,
+            "table": self.table,
+        }
 
     def added_variance(self, signal: Floats) -> Floats:
         remaining, read = np.ones_like(signal), np.zeros_like(signal)
@@ -210,7 +208,7 @@ class Readouts(SensorNoise):
         def normals(draw: int) -> Floats:
             return normal_at(image.shape, draw, inputs.stream[NoiseScope.IMAGE])
 
-        n = typed_arguments(self.numbers())
+        n = typed_arguments(self.arguments(inputs.context))
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):

@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.types import Floats
+from clpipe.stage import Arguments as Arguments
 from clpipe.stage import (
-    Arguments,
     Context,
     Curve,
     Method,
@@ -62,9 +62,6 @@ class Linear(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),) if self.headroom else ()
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"gain": self.gain}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * np.float32(self.gain)

@@ -165,10 +165,6 @@ class Gains(CameraGains):
     def passes(self) -> tuple[Pass, ...]:
         return (APPLY,)
 
-    def arguments(self, context: Context) -> Arguments:
-        red, blue = self.gains
-        return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return apply_gains(image, inputs.context, *map(np.float32, self.gains))
 
@@ -206,6 +202,5 @@ class ArrayAsShot(ArrayMethod, AsShot):
 class Unbalanced(Unchanged):
     """No gains: after ``inverse_white_balance`` the mosaic keeps the sensor's own colours."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no gains"
     any_array: ClassVar = True
