@@ -36,6 +36,10 @@ def as_tuples(value: Any) -> Any:
     return tuple(tuple(float(x) for x in row) for row in rows)
 
 
+OptionalMatrix = Annotated[Matrix, BeforeValidator(as_tuples)] | None
+FROM_CAMERA = "Three rows of three numbers, from camera RGB to linear sRGB."
+
+
 def apply_matrix(image: Floats, matrix: Floats) -> Floats:
     """Multiply the colour of each pixel by a (3, 3) matrix; (height, width, 3) in and out.
 
@@ -76,7 +80,7 @@ class FixedMatrix(Method):
     summary: ClassVar = "your own 3x3 matrix"
     example: ClassVar = {"matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.55]]}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
+    matrix: OptionalMatrix = parameter(
         IDENTITY,
         "Three rows of three numbers. Each row makes the new red, green or blue from the old "
         "three.",
@@ -121,10 +125,8 @@ class AsShot(FixedMatrix):
     example: ClassVar = {}
     other_examples: ClassVar = ({"matrix": [[1.2, -0.2, 0.0], [0.0, 1.0, 0.0], [0.0, -0.5, 1.5]]},)
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from camera RGB to linear sRGB.",
-        auto="the inverse of the matrix that inverse_color_matrix used",
+    matrix: OptionalMatrix = parameter(
+        None, FROM_CAMERA, auto="the inverse of the matrix that inverse_color_matrix used"
     )
 
     def resolve(self, context: Context) -> "AsShot":
@@ -143,9 +145,7 @@ class CameraToSrgb(FixedMatrix):
     summary: ClassVar = "camera RGB to linear sRGB, for raw files of a camera"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = camera_parameter(
-        "Three rows of three numbers, from camera RGB to linear sRGB."
-    )
+    matrix: OptionalMatrix = camera_parameter(FROM_CAMERA)
 
     def resolve(self, context: Context) -> "CameraToSrgb":
         """Return the method with a matrix.

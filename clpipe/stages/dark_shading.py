@@ -54,12 +54,10 @@ def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats
         three * f2 + three * f - three * f3 + one,
         f3,
     )
-    zero = np.zeros(1, np.uint32)
-    stage, draw = np.full(1, stream.stage, np.uint32), np.full(1, number, np.uint32)
     total = np.zeros(count, np.float32)
     for k, weight in enumerate(weights):
         knot = (whole + k).astype(np.uint32)
-        total = total + normal_of(philox(knot, zero, draw, stage, stream)[0]) * weight
+        total = total + normal_of(philox(knot, 0, number, stream.stage, stream)[0]) * weight
     return np.asarray(total * np.float32(0.24078))
 
 

@@ -1,12 +1,10 @@
 """Inverse colour matrix: from linear sRGB to a camera's white-balanced RGB, for a render."""
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
-from pydantic import BeforeValidator
-
-from clpipe.camera.profile import IDENTITY, Matrix
+from clpipe.camera.profile import IDENTITY
 from clpipe.stage import Context, StageRole, camera_parameter, rgb_stage
-from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, as_tuples
+from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, OptionalMatrix, as_tuples
 
 
 class SrgbToCamera(FixedMatrix):
@@ -21,7 +19,7 @@ class SrgbToCamera(FixedMatrix):
     summary: ClassVar = "linear sRGB to camera RGB, if the camera's matrix is known"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = camera_parameter(
+    matrix: OptionalMatrix = camera_parameter(
         "Three rows of three numbers, from linear sRGB to camera RGB.", more="; else none"
     )
 

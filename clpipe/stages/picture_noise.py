@@ -37,13 +37,8 @@ TABLE_SIZE = 256  # entries of the kernel's table
 UNKNOWN = "unknown"  # the ISO of images without a stated ISO, in a report
 RESOLVED_SIZE = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
-MIXING_NAMES = (
-    "green_red",
-    "green_green",
-    "blue_red",
-    "blue_green",
-    "blue_blue",
-)  # kernel arguments
+# Kernel arguments.
+MIXING_NAMES = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
 Sigmas = Annotated[tuple[Sigma, ...], Field(strict=False, min_length=2, max_length=TABLE_SIZE)]

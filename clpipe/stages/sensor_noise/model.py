@@ -39,6 +39,11 @@ def read_noise_parameter(auto: str) -> Any:
     return parameter(None, text, "signal^2", auto, ge=0, le=1)
 
 
+def alternative(text: str, unit: str = "", **limits: Any) -> Any:
+    """Declare a parameter of a parametrisation that may replace a and b."""
+    return parameter(None, text, unit, "not used", **limits)
+
+
 class SensorNoise(SignalMethod):
     """The strength of the noise in one of three parametrisations, and the full well.
 
@@ -49,50 +54,32 @@ class SensorNoise(SignalMethod):
 
     a: float | None = shot_noise_parameter("from the camera and ISO")
     b: float | None = read_noise_parameter("from the camera and ISO")
-    system_gain: float | None = parameter(
-        None, "Instead of a: the system gain (EMVA 1288).", "DN/e-", "not used", gt=0
+    system_gain: float | None = alternative(
+        "Instead of a: the system gain (EMVA 1288).", "DN/e-", gt=0
     )
-    read_noise: float | None = parameter(
-        None,
-        "Instead of b: standard deviation of the noise before the gain (EMVA 1288).",
-        "e-",
-        "not used",
-        ge=0,
+    read_noise: float | None = alternative(
+        "Instead of b: standard deviation of the noise before the gain (EMVA 1288).", "e-", ge=0
     )
-    adc_noise: float | None = parameter(
-        None,
-        "With read_noise: standard deviation of the noise after the gain.",
-        "DN",
-        "not used",
-        ge=0,
+    adc_noise: float | None = alternative(
+        "With read_noise: standard deviation of the noise after the gain.", "DN", ge=0
     )
-    chi: float | None = parameter(
-        None,
+    chi: float | None = alternative(
         "Instead of a and b, with theta: electrons at y = 1 and theta = 1 (Bielova et al. 2019).",
         "e-",
-        "not used",
         gt=0,
     )
-    theta: float | None = parameter(
-        None, "With chi: the analogue gain (Bielova et al. 2019).", "", "not used", gt=0
-    )
-    b_before: float | None = parameter(
-        None,
+    theta: float | None = alternative("With chi: the analogue gain (Bielova et al. 2019).", gt=0)
+    b_before: float | None = alternative(
         "With chi: b', the variance of the noise before the gain (Bielova et al. 2019).",
         "signal^2",
-        "not used",
         ge=0,
     )
-    b_after: float | None = parameter(
-        None,
+    b_after: float | None = alternative(
         "With chi: b'', the variance of the noise after the gain (Bielova et al. 2019).",
         "signal^2",
-        "not used",
         ge=0,
     )
-    p0: float | None = parameter(
-        None, "With chi: the pedestal (Bielova et al. 2019).", "signal", "not used", ge=0
-    )
+    p0: float | None = alternative("With chi: the pedestal (Bielova et al. 2019).", "signal", ge=0)
     full_well: float | None = camera_parameter(
         "Largest number of electrons that a pixel holds.", "e-", more="; else no limit", gt=0
     )

@@ -30,10 +30,7 @@ DEFAULT_RATIO = 16.0  # for sensors whose profile does not state a ratio
 MAX_READOUTS = 4
 # Signal of a readout at which its weight becomes 0, and the slope below it. The transition
 # therefore begins at 0.85.
-HANDOVER_END, HANDOVER_SLOPE = (
-    np.float32(0.95),
-    np.float32(10.0),
-)
+HANDOVER_END, HANDOVER_SLOPE = np.float32(0.95), np.float32(10.0)
 
 
 class Readout(NamedTuple):
