@@ -131,6 +131,14 @@ def test_every_lock_says_what_it_guards():
                 assert "  # " in line or before.lstrip().startswith("# "), f"{path}: {line}"
 
 
+def test_authors_of_stages_need_not_know_how_numbers_are_repeated():
+    folders = (ROOT / "clpipe" / name for name in ("stages", "reference", "camera"))
+    files = [path for folder in folders for path in folder.rglob("*.py")]
+    assert len(files) > 100
+    for path in (*files, STAGES):
+        assert not re.search(r"\btrac(e|es|ed|ing|eable)\b", path.read_text()), path
+
+
 def test_every_file_it_names_is_there():
     text = TEXT + STAGES.read_text()
     for name in re.findall(r"`((?:clpipe|kernels|tests|tools|docs)/[\w./]+)`", text):

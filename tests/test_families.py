@@ -12,7 +12,7 @@ import pytest
 
 from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import float32, pure
+from clpipe.base.pure import pure
 from clpipe.base.tracing import NotTraceableError, Trace, call
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import COMPUTED, Chain
@@ -160,7 +160,7 @@ def test_operations_are_repeated_in_order():
         return {
             "a": (z, abs(z) % 3, *halves(x)),
             "b": [max(x, y), 7, *numpys],
-            "c": float32(x) * np.float32(0.1),
+            "c": pure(np.float32)(x) * np.float32(0.1),
         }
 
     trace = Trace([3.0, 2.0])

@@ -8,15 +8,19 @@ import re
 import numpy as np
 import pytest
 
+from clpipe.base.cache import BoundedCache
 from clpipe.chain import registry
+from clpipe.chain.families import ComputedChain
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
-from clpipe.chain.settings import settings_from
+from clpipe.chain.settings import overlay, settings_from
 from clpipe.engine.bands import Cpu
 from clpipe.engine.codegen import write_kernel
 from clpipe.engine.plan import make_plan
+from clpipe.engine.runner import Runner
 from tests.conftest import ROOT, STILL_LIFE, cli_output, run_python
 from tests.test_contributing import block
+from tests.test_families import assert_equal, made
 
 PYTHON, OPENCL = block("python"), block("c")
 
@@ -74,7 +78,7 @@ def test_without_its_file_the_stage_is_unknown(clpipe):
         (("self.focal_length**-2", "1 / 0"), r"vignette.py, line \d\d: ZeroDivisionError"),
         (
             ('"scale": scale', '"scale": "x"'),
-            "arguments.. returns 'x' as 'scale'; its type must be one of float, float32",
+            "arguments.. returns 'x' as 'scale'; its type must be one of float, int, float32",
         ),
         (('"scale": scale', '"skale": scale'), "vignette needs the argument 'scale', but .*skale"),
         (('Pass("vignette"', 'Pass("vinette"'), "a pass calls the function vinette, but"),
@@ -117,6 +121,41 @@ def renamed(stage_file, name):
     status = stage_file.stat()
     stage_file.write_text(stage_file.read_text().replace('"vignette", arg', f'"{name}", arg'))
     os.utime(stage_file, ns=(status.st_atime_ns, status.st_mtime_ns))  # as in the same second
+
+
+@pytest.mark.parametrize(
+    ("formula", "is_computed"),
+    [
+        ("1 / np.sqrt(self.focal_length) ** 4", True),
+        ("1 / np.clip(np.hypot(self.focal_length, 3), 1, 1e6) ** 2", True),
+        ("pure(math.gamma)(self.focal_length / 9)", True),
+        ("math.gamma(self.focal_length / 9)", False),
+    ],
+)
+def test_the_arguments_of_a_stage_are_computed_for_drawn_numbers(
+    clpipe, stage_file, device, monkeypatch, formula, is_computed
+):
+    """Arguments, launches and pixels are those of a chain that is made for the numbers alone."""
+    monkeypatch.setattr("clpipe.chain.families.FAMILIES", BoundedCache(64))
+    imports = "import math\n\nfrom clpipe.stage import pure\n\nimport numpy as np"
+    text = PYTHON.replace("self.focal_length**-2", formula).replace("import numpy as np", imports)
+    stage_file.write_text(text)
+    registry.load_stage_file(stage_file)
+    image = np.random.default_rng(1).random((9, 21, 3), np.float32)
+    general = settings_from({"stages": ["exposure", "vignette"]})
+    for focal_length in (9.0, 12.5, 14.0, 15.25):
+        settings = overlay(general, {"vignette": {"focal_length": focal_length}})
+        chain, expected = make_chain(settings), made(settings, monkeypatch)
+        assert_equal(chain, expected)
+        sources = [
+            [write_kernel(plan, launch, 8).source for launch in plan.launches]
+            for plan in map(make_plan, (chain, expected))
+        ]
+        assert sources[0] == sources[1]
+        images = [Runner(each, device).run(image, "a").image for each in (chain, expected)]
+        assert np.array_equal(*images)
+    assert isinstance(chain, ComputedChain)
+    assert (chain.structure is not None) is is_computed  # whether no code of the stage runs again
 
 
 @pytest.mark.parametrize(

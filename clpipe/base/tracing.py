@@ -6,18 +6,17 @@ precision, without the surrounding code. If a guard fails, the code would have t
 so it must be traced again. PyTorch's Dynamo and JAX work in the same way.
 """
 
+import math
 import operator
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from types import FunctionType, MethodType
 from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
-
-from clpipe.base.types import plain_float
 
 T = TypeVar("T")
 Repeat = Callable[[Sequence[Any]], Any]
@@ -50,6 +49,10 @@ class Traced:
     It has the operators of a float. NumPy's functions of scalars are traced, and :func:`call`
     traces any other function. Code that needs a plain float gets the value, and a guard then
     requires this value. A traced number is not hashable, so that no cache keeps it.
+
+    >>> (x,) = Trace([0.3]).inputs
+    >>> [type(f(x)).__name__ for f in (np.sqrt, np.sinc, math.floor, math.sin)]
+    ['Traced', 'Traced', 'Traced', 'float']
     """
 
     __slots__ = ("name", "trace", "value")
@@ -85,26 +88,21 @@ class Traced:
     def __repr__(self) -> str:
         return repr(float(self))
 
+    def item(self) -> Any:
+        """Return the Python number of a NumPy number, like NumPy's method."""
+        return call(_ITEM, self) if isinstance(self.value, np.generic) else self
+
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
-        scalars = all(isinstance(each, (Traced, *NUMBER_TYPES)) for each in inputs)
-        if scalars and method == "__call__" and ufunc.nout == 1 and not options:
-            return call(UFUNCS.get(ufunc) or scalar_function(ufunc), *inputs)
-        plain = [float(each) if isinstance(each, Traced) else each for each in inputs]
-        return getattr(ufunc, method)(*plain, **options)
+        if method != "__call__":
+            return getattr(ufunc, method)(*map(_plain, inputs), **options)
+        return self.__array_function__(UFUNCS.get(ufunc, ufunc), (), inputs, options)
 
-
-@cache
-def scalar_function(ufunc: Any) -> Callable[..., Any]:
-    """Return a function of NumPy with Python floats as results, where NumPy has its float64.
-
-    >>> scalar_function(np.sqrt)(0.25)
-    0.5
-    """
-
-    def function(*arguments: Any) -> Any:
-        return plain_float(ufunc(*arguments))
-
-    return function
+    def __array_function__(self, function: Any, types: Any, inputs: Any, options: Any) -> Any:
+        if not options and all(isinstance(each, (Traced, *NUMBER_TYPES)) for each in inputs):
+            result = function(*map(value_of, inputs))
+            if isinstance(result, NUMBER_TYPES):
+                return self.trace.number(function, inputs, result)
+        return function(*map(_plain, inputs), **{k: _plain(v) for k, v in options.items()})
 
 
 def _calculation(function: Callable[..., Any], swapped: bool = False) -> Callable[..., Any]:
@@ -132,6 +130,8 @@ for _name in ("add", "sub", "mul", "truediv", "pow", "mod"):
     setattr(Traced, f"__r{_name}__", _calculation(getattr(operator, _name), swapped=True))
 for _name in ("neg", "abs"):
     setattr(Traced, f"__{_name}__", _calculation(getattr(operator, _name)))
+for _name in ("floor", "ceil", "trunc"):
+    setattr(Traced, f"__{_name}__", _calculation(getattr(math, _name)))
 for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
     setattr(Traced, f"__{_name}__", _comparison(getattr(operator, _name)))
 
@@ -139,6 +139,16 @@ for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
 def value_of(number: Any) -> Any:
     """Return the value of a traced number; return any other object unchanged."""
     return number.value if isinstance(number, Traced) else number
+
+
+_ITEM = operator.methodcaller("item")
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without traced numbers: a guard requires their values."""
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return float(value) if isinstance(value, Traced) else value
 
 
 def call(function: Callable[..., Any], *arguments: Any) -> Any:

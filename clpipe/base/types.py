@@ -22,8 +22,3 @@ def plain(values: Any) -> Any:
     if isinstance(values, PurePath):
         return str(values)
     return values.tolist() if isinstance(values, np.ndarray | np.generic) else values
-
-
-def plain_float(number: Any) -> Any:
-    """Return a float64 of NumPy as a Python float, which is written without its type."""
-    return float(number) if type(number) is np.float64 else number

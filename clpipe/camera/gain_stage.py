@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from clpipe.base.numbers import pure
+from clpipe.base.pure import pure
 
 MAX_VALUE = 1e9  # the largest value of a sensor, so that its square is finite as well
 Positive = Annotated[float, Field(gt=0, le=MAX_VALUE, allow_inf_nan=False)]
@@ -92,7 +92,7 @@ class GainStage(BaseModel):
         return float(np.sqrt(np.clip(after2, 0, read2.min())))
 
 
-@lru_cache(maxsize=1024)  # equal tables share one object, which `pure` needs
+@lru_cache(maxsize=1024)  # equal tables share one object, so that chains share it
 def _ratios(values: tuple[float, ...], divisors: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(value / divisor for value, divisor in zip(values, divisors, strict=True))
 

@@ -194,17 +194,16 @@ class Camera(BaseModel):
 
     def row_noise(self, iso: float) -> float:
         """Return the standard deviation of row offsets in signal units; see :meth:`noise`."""
-        stage = self.gain_stage(iso)
-        return self._line_noise(iso, stage, stage.row_noise, self.row_noise_ratio)
+        return self._offset_noise(iso, "row_noise", self.row_noise_ratio)
 
     def column_noise(self, iso: float) -> float:
         """Return the standard deviation of column offsets in signal units; see :meth:`noise`."""
-        stage = self.gain_stage(iso)
-        return self._line_noise(iso, stage, stage.column_noise, self.column_noise_ratio)
+        return self._offset_noise(iso, "column_noise", self.column_noise_ratio)
 
-    def _line_noise(
-        self, iso: float, stage: GainStage, table: tuple[float, ...] | None, ratio: float
-    ) -> float:
+    def _offset_noise(self, iso: float, name: str, ratio: float = 0.0) -> float:
+        """Return the value of a gain stage's table, else a multiple of its read noise."""
+        stage = self.gain_stage(iso)
+        table = getattr(stage, name)
         dn = stage.at(iso, table) if table else ratio * stage.at(iso, stage.read_noise)
         return dn / self.signal_range
 
@@ -231,8 +230,7 @@ class Camera(BaseModel):
 
         Raises like :meth:`noise`.
         """
-        stage = self.gain_stage(iso)
-        return self._line_noise(iso, stage, stage.black_level_error, 0.0)
+        return self._offset_noise(iso, "black_level_error")
 
     def signal_of(self, electrons: float, iso: float) -> float:
         """Return the signal of a charge in e- at an ISO; raises like :meth:`noise`."""

@@ -18,7 +18,7 @@ from clpipe.chain.void import black_area_warning
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
 from clpipe.stage import ImageLayer
-from clpipe.stage.method import optics_names
+from clpipe.stage.method import parameters_with
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,10 @@ def _with_camera_values(chain: Chain, shot: tuple[tuple[str, float], ...]) -> Ch
     """Return the chain with an image's camera values; the same chain if no step needs them."""
     active = [chain.settings.method(s.name) for s in chain.steps if s.passes]
     needed = {
-        n for method in active for n in optics_names(type(method)) if getattr(method, n) is None
+        n
+        for method in active
+        for n in parameters_with(type(method), "optics")
+        if getattr(method, n) is None
     }
     if chain.camera.dark_current:
         needed.add("exposure_time")

@@ -232,7 +232,7 @@ def check_passes(name: str, stage: Stage, method: Method, context: Context) -> N
                     )
         for argument, value in arguments.items():
             if not isinstance(value, ARGUMENT_TYPES):
-                allowed = ", ".join(["float", *(t.__name__ for t in ARGUMENT_TYPES)])
+                allowed = ", ".join(["float", "int", *(t.__name__ for t in ARGUMENT_TYPES)])
                 raise RequestError(
                     f"stage {name}: arguments() returns {value!r} as '{argument}'; its type must "
                     f"be one of {allowed}"

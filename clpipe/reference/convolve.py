@@ -7,7 +7,7 @@ describe which pixels contribute to a pixel, so they are the mirror image.
 
 import numpy as np
 
-from clpipe.base.numbers import pure
+from clpipe.base.pure import pure
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.image import tap
 

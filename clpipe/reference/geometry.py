@@ -45,6 +45,19 @@ class Margins(NamedTuple):
 
 NO_MARGINS = Margins()
 
+# x and y in px from the upper left corner; None, for one or both, is the centre.
+Centre = tuple[float | None, float | None]
+
+
+def centre_in(centre: Centre, width: float, height: float) -> tuple[float, float]:
+    """Return a point in an image of some size, in px from its upper left corner.
+
+    >>> centre_in((None, 2.0), 6, 8)
+    (3.0, 2.0)
+    """
+    x, y = centre
+    return width / 2 if x is None else x, height / 2 if y is None else y
+
 
 class Geometry(Protocol):
     """How a stage moves the pixels of an image of some width and height, in px."""

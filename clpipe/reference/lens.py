@@ -12,7 +12,7 @@ import numpy as np
 from clpipe.base.cache import cached_hash
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array
-from clpipe.reference.geometry import NO_MARGINS, Margins
+from clpipe.reference.geometry import NO_MARGINS, Centre, Margins, centre_in
 from clpipe.reference.intrinsics import (
     DECENTRING,
     FULL_OPENCV,
@@ -60,7 +60,7 @@ class DistortionMap:
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     focal: tuple[float, float] | None = None
     relative_focal_length: float | None = None
-    centre: tuple[float | None, float | None] = (None, None)
+    centre: Centre = (None, None)
     red: Radial = STRAIGHT
     blue: Radial = STRAIGHT
     half_diagonals: float | None = None
@@ -129,13 +129,12 @@ class DistortionMap:
         scale = self.scale(width, height)
         width, height = self.size(width, height)
         unit = self.unit(width, height)
-        middle = width / 2, height / 2
-        centre = [m if c is None else c for c, m in zip(self.centre, middle, strict=True)]
+        centre = centre_in(self.centre, width, height)
         has_focal = bool(self.focal or self.relative_focal_length)
         if known is None:
             if not has_focal:
                 return None
-            known = Intrinsics(width, height, *unit, centre[0], centre[1])
+            known = Intrinsics(width, height, *unit, *centre)
         stated = {"cx": centre[0], "cy": centre[1]} | (
             {"fx": unit[0], "fy": unit[1]} if has_focal else {}
         )
@@ -196,8 +195,7 @@ class _ScaledLens:
     def __init__(self, lens: DistortionMap, width: int, height: int, scale: float) -> None:
         self.lens, self.scale, self.side = lens, scale, lens.side(width, height)
         self.unit = lens.unit(width, height)
-        middle = width / 2, height / 2
-        self.centre = tuple(m if c is None else c for c, m in zip(lens.centre, middle, strict=True))
+        self.centre = centre_in(lens.centre, width, height)
         self.size = width, height
         left, top, right, bottom = lens.margins
         offsets = self._corners(0, 0, width, height)

@@ -9,7 +9,7 @@ import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,11 +71,13 @@ def _key_of(owner: str) -> tuple[int, int]:
     return int.from_bytes(digest[:4], "little"), int.from_bytes(digest[4:], "little")
 
 
-def philox(c0: Words, c1: Words, c2: Words, c3: Words, stream: Stream) -> tuple[Words, ...]:
+Counter: TypeAlias = Words | int
+
+
+def philox(c0: Counter, c1: Counter, c2: Counter, c3: Counter, stream: Stream) -> tuple[Words, ...]:
     """Apply Philox4x32-10 to four counters, which are broadcast against each other; four words.
 
-    >>> zero = np.zeros(1, np.uint32)
-    >>> [hex(int(w[0])) for w in philox(zero, zero, zero, zero, Stream(0, 0, 0))]
+    >>> [hex(int(w[0])) for w in philox(np.zeros(1, np.uint32), 0, 0, 0, Stream(0, 0, 0))]
     ['0x6627e8d5', '0xe169c58d', '0xbc57ac4c', '0x9b00dbd8']
     """
     w0, w1, w2, w3 = (c.astype(np.uint64) for c in np.broadcast_arrays(c0, c1, c2, c3))
@@ -175,13 +177,7 @@ def words_at(shape: tuple[int, ...], draw: int, stream: Stream) -> tuple[Words, 
     """Return the four words of each counter (x, y // 4, draw, stage), each (height / 4, width)."""
     height, width = shape[:2]
     quarter = np.arange((height + 3) // 4, dtype=np.uint32)[:, None]
-    return philox(
-        np.arange(width, dtype=np.uint32)[None, :],
-        quarter,
-        np.full((1, 1), draw, np.uint32),
-        np.full((1, 1), stream.stage, np.uint32),
-        stream,
-    )
+    return philox(np.arange(width, dtype=np.uint32), quarter, draw, stream.stage, stream)
 
 
 def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
@@ -197,6 +193,4 @@ def normal_at(shape: tuple[int, ...], draw: int, stream: Stream) -> Floats:
 
 def normal_of_line(count: int, stream: Stream) -> Floats:
     """Return a standard normal for each of the first ``count`` rows or columns, (count,)."""
-    zero = np.zeros(1, np.uint32)
-    stage = np.full(1, stream.stage, np.uint32)
-    return normal_of(philox(np.arange(count, dtype=np.uint32), zero, zero, stage, stream)[0])
+    return normal_of(philox(np.arange(count, dtype=np.uint32), 0, 0, stream.stage, stream)[0])

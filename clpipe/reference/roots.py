@@ -7,7 +7,6 @@ close to a root. The offset, in signal units, keeps the slope of the root finite
 
 import numpy as np
 
-from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 
 
@@ -41,11 +40,10 @@ def in_steps(root: Floats) -> Floats:
     return (np.maximum(root, np.float32(0)) + np.float32(12)) - np.float32(12)
 
 
-@pure
 def noise_in_roots(sigma: float, level: float, offset: float) -> float:
     """Return the standard deviation in roots of noise of ``sigma`` at a level, in signal units.
 
-    >>> round(noise_in_roots(0.01, 0.24, 0.01), 6)
+    >>> round(float(noise_in_roots(0.01, 0.24, 0.01)), 6)
     0.01
     """
-    return float(sigma / (2 * np.sqrt(level + offset)))
+    return sigma / (2 * np.sqrt(level + offset))

@@ -8,7 +8,7 @@ from math import gamma
 
 import numpy as np
 
-from clpipe.base.numbers import pure
+from clpipe.base.pure import pure
 from clpipe.base.types import Floats
 from clpipe.reference.math import exponential_minus_1, negative_log
 from clpipe.reference.random import Words, in_upper_half, tail_probability

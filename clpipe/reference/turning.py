@@ -10,7 +10,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Floats
-from clpipe.reference.geometry import NO_MARGINS, Margins
+from clpipe.reference.geometry import NO_MARGINS, Centre, Margins, centre_in
 from clpipe.reference.resample import Axis, Parameters
 from clpipe.reference.warp import gather
 
@@ -53,7 +53,7 @@ class CameraRotation:
     angle: float
     focal_length: float | None = None
     relative_focal_length: float | None = None
-    centre: tuple[float | None, float | None] = (None, None)
+    centre: Centre = (None, None)
     margins: Margins = NO_MARGINS
 
     @property
@@ -88,8 +88,7 @@ class CameraRotation:
 
     def principal_point(self, width: int, height: int) -> tuple[float, float]:
         """Return the principal point, from the image's corner, px."""
-        principal_point = (side / 2 for side in self.margins.frame_size(width, height))
-        x, y = (m if c is None else c for m, c in zip(principal_point, self.centre, strict=True))
+        x, y = centre_in(self.centre, *self.margins.frame_size(width, height))
         return self.margins.left + x, self.margins.top + y
 
     def max_distance(self, width: int, height: int) -> float:

@@ -7,7 +7,8 @@ coarse as possible with an error below :data:`MAX_ERROR` at the centres of its c
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
+from operator import add
 from typing import Any, ClassVar
 
 import numpy as np
@@ -72,19 +73,13 @@ class Grid:
     def fields(self, rows: Array, columns: Array) -> Iterator[Floats]:
         """Return each field at these rows and columns, (row, column) float32, like the kernel."""
         first, weights = self.at(rows, 0)
-        lines = sum_of(w[:, None, None] * self.nodes[first + k] for k, w in enumerate(weights))
+        lines = reduce(
+            add, (w[:, None, None] * self.nodes[first + k] for k, w in enumerate(weights))
+        )
         first, weights = self.at(columns, 1)
         for field in range(6):
             field_lines = lines[:, :, field]
-            yield sum_of(w * field_lines[:, first + k] for k, w in enumerate(weights))
-
-
-def sum_of(terms: Iterator[Floats]) -> Floats:
-    """Return the sum of terms, in order."""
-    total = next(terms)
-    for term in terms:
-        total = total + term
-    return total
+            yield reduce(add, (w * field_lines[:, first + k] for k, w in enumerate(weights)))
 
 
 def lagrange(t: Floats) -> list[Floats]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
+from clpipe.reference.geometry import Centre, centre_in
 from clpipe.reference.intrinsics import OPENCV_FISHEYE, Intrinsics, minimax_fit
 
 Coefficients = tuple[float, ...]
@@ -82,7 +83,7 @@ class WideLens:
     fy: float
     field_of_view: float
     size: tuple[int, int] | None = None
-    centre: tuple[float | None, float | None] = (None, None)
+    centre: Centre = (None, None)
 
     @property
     def picture(self) -> tuple[int, int]:
@@ -105,9 +106,7 @@ class WideLens:
     @property
     def principal_point(self) -> tuple[float, float]:
         """Return cx and cy in px from the corner."""
-        middle = (side / 2 for side in self.picture)
-        cx, cy = (m if c is None else c for c, m in zip(self.centre, middle, strict=True))
-        return cx, cy
+        return centre_in(self.centre, *self.picture)
 
     def rays(self, x: Array, y: Array) -> Array:
         """Return the directions that positions of the image see.

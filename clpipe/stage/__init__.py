@@ -8,6 +8,7 @@ Stage files import only the names in ``__all__`` here, and only from here. This 
 ``camera``, ``reference`` and ``base``, and nothing about chains, devices or files.
 """
 
+from clpipe.base.pure import pure
 from clpipe.base.types import Array, Floats
 from clpipe.stage.arrays import PERIOD, levels_table, period_of
 from clpipe.stage.bases import (
@@ -25,7 +26,16 @@ from clpipe.stage.bases import (
 )
 from clpipe.stage.checking import run_reference, variant_label, variants
 from clpipe.stage.context import Context, ImageLayer, ReferenceContext
-from clpipe.stage.method import Method, Stage, StageRole, parameter
+from clpipe.stage.method import (
+    Method,
+    Stage,
+    StageRole,
+    camera_parameter,
+    optics_parameter,
+    parameter,
+    rgb_stage,
+    sensor_stage,
+)
 from clpipe.stage.passes import (
     PREVIOUS,
     Argument,
@@ -82,14 +92,19 @@ __all__ = [
     "TableLookup",
     "Unchanged",
     "bytes_of",
+    "camera_parameter",
     "levels_table",
     "odd_size",
+    "optics_parameter",
     "parameter",
     "period_of",
     "principal_point_parameter",
+    "pure",
+    "rgb_stage",
     "run_reference",
     "sensor_bits",
     "sensor_normals",
+    "sensor_stage",
     "typed_arguments",
     "variant_label",
     "variants",

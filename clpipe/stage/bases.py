@@ -9,14 +9,15 @@ from clpipe.base.types import Array, Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.curve import curve_index
 from clpipe.stage.context import Context, ImageLayer, ReferenceContext
-from clpipe.stage.method import Method, parameter
+from clpipe.stage.method import Method, camera_parameter, optics_parameter, parameter
 from clpipe.stage.passes import Arguments, Pass, TableLookup
 from clpipe.stage.signal import SignalMethod
 
 
 class Unchanged(Method):
-    """Leaves the image unchanged, at no cost. A subclass sets the method's name."""
+    """Leaves the image unchanged, at no cost. A subclass may set the method's name."""
 
+    method: ClassVar = "none"
     kernel: ClassVar = ""
 
     def passes(self) -> tuple[Pass, ...]:
@@ -62,20 +63,10 @@ class FocalLengthMethod(Method):
 
     alternatives: ClassVar = frozenset({"fx", "focal_length"})
 
-    fx: float | None = parameter(
-        None, "Horizontal focal length.", "px", "the camera's", optics=True, gt=0, le=1e7
-    )
-    focal_length: float | None = parameter(
-        None, "Focal length.", "mm", "the camera's", optics=True, gt=0, le=1e4
-    )
-    sensor_width: float | None = parameter(
-        None,
-        "Width of the sensor, along the longer side of the image.",
-        "mm",
-        "the camera's",
-        optics=True,
-        gt=0,
-        le=1e4,
+    fx: float | None = optics_parameter("Horizontal focal length.", "px", gt=0, le=1e7)
+    focal_length: float | None = optics_parameter("Focal length.", "mm", gt=0, le=1e4)
+    sensor_width: float | None = optics_parameter(
+        "Width of the sensor, along the longer side of the image.", "mm", gt=0, le=1e4
     )
 
     @property
@@ -156,7 +147,6 @@ class Span(NamedTuple):
 class Noiseless(Unchanged):
     """A stage that only adds or only removes noise, in a chain without noise."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no noise"
 
 
@@ -189,13 +179,8 @@ class GaussianNoise(SignalMethod):
     method: ClassVar = "gaussian"
     example: ClassVar = {"sigma": 0.01}
 
-    sigma: float | None = parameter(
-        None,
-        "Standard deviation of the offsets.",
-        "signal",
-        "from the camera and ISO",
-        ge=0,
-        le=1,
+    sigma: float | None = camera_parameter(
+        "Standard deviation of the offsets.", "signal", more=" and ISO", ge=0, le=1
     )
 
     def draw(self) -> tuple[Pass, ...]:
@@ -207,9 +192,6 @@ class GaussianNoise(SignalMethod):
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         return input_variance + np.float32(self.sigma) ** 2
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"sigma": self.sigma}
 
 
 def odd_size(size: int, largest: int) -> int:

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, PrivateAttr
 
-from clpipe.base.types import Floats, plain_float
+from clpipe.base.types import Floats
 from clpipe.reference.geometry import NO_MARGINS, Geometry, Margins
 from clpipe.stage.context import Context, ReferenceContext
-from clpipe.stage.passes import Arguments, Kind, Pass
+from clpipe.stage.passes import Arguments, CompileTime, Kind, Pass
 
 
 def parameter(
@@ -49,6 +49,22 @@ def parameter(
         "optics": optics,
     }
     return Field(default, description=text, json_schema_extra=extra, **limits)
+
+
+def camera_parameter(text: str, unit: str = "", more: str = "", **options: Any) -> Any:
+    """Declare a parameter whose value is the camera's, if it has one, see :func:`parameter`.
+
+    ``more`` continues the words "from the camera".
+    """
+    return parameter(None, text, unit, f"from the camera{more}", **options)
+
+
+def optics_parameter(text: str, unit: str = "", more: str = "", **limits: Any) -> Any:
+    """Declare a parameter that states a fact of the optics, see :func:`parameter`.
+
+    ``more`` continues the words "the camera's".
+    """
+    return parameter(None, text, unit, f"the camera's{more}", optics=True, **limits)
 
 
 class Method(BaseModel):
@@ -142,7 +158,11 @@ class Method(BaseModel):
 
     def optics(self) -> Mapping[str, float]:
         """Return the facts of the optics that this unresolved method states, by their names."""
-        return {n: v for n in optics_names(type(self)) if (v := getattr(self, n)) is not None}
+        return {
+            n: v
+            for n in parameters_with(type(self), "optics")
+            if (v := getattr(self, n)) is not None
+        }
 
     def resolve(self, context: Context) -> "Method":
         """Return the method with a value for every parameter that camera or chain decides."""
@@ -150,7 +170,7 @@ class Method(BaseModel):
 
     def with_optics(self, context: Context) -> Self:
         """Return a copy in which known optics replace the parameters that are None."""
-        names = optics_names(type(self))
+        names = parameters_with(type(self), "optics")
         values = {name: getattr(context.optics, name) for name in names}
         return self.with_defaults(**values) if values else self
 
@@ -206,28 +226,54 @@ class Method(BaseModel):
         return None if self.passes() else input_variance
 
     def arguments(self, context: Context) -> Arguments:
-        """Return the kernel arguments by name, from the resolved parameters."""
-        return {}
+        """Return the kernel arguments by name, from the resolved parameters.
+
+        The default takes those of the passes that have the name of a parameter or of a property. A
+        structural parameter is compiled in, like the "pattern" of the mosaic and the "extent" of
+        the image.
+        """
+        found: dict[str, Any] = {}
+        for name in dict.fromkeys(name for each in self.passes() for name in each.all_arguments):
+            if name in FROM_CONTEXT:
+                found[name] = FROM_CONTEXT[name](context)
+            elif name in parameters_with(type(self), "structural"):
+                found[name] = CompileTime(str(getattr(self, name)).upper())
+            elif hasattr(type(self), name) or name in type(self).model_fields:
+                found[name] = getattr(self, name)
+        return found
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         """Run the stage in NumPy: (height, width[, channel]) float32 in and out."""
         raise NotImplementedError(type(self).__name__)
 
     def with_defaults(self, **values: Any) -> Self:
-        """Return a copy in which ``values`` replace the parameters that are None."""
+        """Return a copy in which ``values`` replace the parameters that are None.
+
+        NumPy's numbers become those of Python.
+        """
         missing = {
-            name: plain_float(value)
+            name: value.item() if hasattr(value, "item") else value
             for name, value in values.items()
             if getattr(self, name) is None and value is not None
         }
         return self.model_copy(update=missing) if missing else self
 
 
+# Kernel arguments that every method has.
+FROM_CONTEXT: Mapping[str, Callable[[Context], CompileTime]] = {
+    "pattern": lambda context: context.cfa,
+    "extent": lambda context: CompileTime("e"),
+}
+
+
 @cache
-def optics_names(method: type[Method]) -> tuple[str, ...]:
-    """Return the parameters of a method that state its camera's optics; see :func:`parameter`."""
+def parameters_with(method: type[Method], trait: str) -> tuple[str, ...]:
+    """Return the parameters of a method with a trait of :func:`parameter`, such as "optics"."""
     extras: dict[str, Any] = {k: f.json_schema_extra for k, f in method.model_fields.items()}
-    return tuple(name for name, extra in extras.items() if extra and extra.get("optics"))
+    return tuple(name for name, extra in extras.items() if extra and extra.get(trait))
+
+
+Methods: TypeAlias = tuple[type[Method], ...]
 
 
 class StageRole(Enum):
@@ -269,7 +315,7 @@ class Stage:
     summary: str
     reads: Kind
     writes: Kind
-    methods: tuple[type[Method], ...]
+    methods: Methods
     explain: Callable[[Context], str] | None = None
     folder: Path | None = None  # folder of a plug-in's kernel files
     also_reads: tuple[Kind, ...] = ()
@@ -305,3 +351,15 @@ class Stage:
     def by_name(self) -> dict[str, type[Method]]:
         """The methods by their names."""
         return {m.method: m for m in self.methods}
+
+
+def sensor_stage(
+    name: str, summary: str, methods: Methods, role: StageRole = StageRole.SENSOR
+) -> Stage:
+    """Return a stage that is an effect of the sensor on the mosaic, see :class:`Stage`."""
+    return Stage(name, summary, Kind.MOSAIC, Kind.MOSAIC, methods, role=role)
+
+
+def rgb_stage(name: str, summary: str, methods: Methods, **options: Any) -> Stage:
+    """Return a stage that reads and writes linear RGB, see :class:`Stage`."""
+    return Stage(name, summary, Kind.RGB, Kind.RGB, methods, **options)

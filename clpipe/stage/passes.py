@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clpipe.base.numbers import float32, is_float
+from clpipe.base.tracing import call, value_of
 from clpipe.base.types import Array
 from clpipe.reference.resample import Axis, Resampler
 
@@ -170,19 +170,24 @@ class CompileTime:
 
 
 Argument = np.float32 | np.uint32 | np.int32 | Array | CompileTime
-# Arguments by name. A float becomes a np.float32. None is a parameter that is not resolved yet.
+# Arguments by name. None is a parameter that is not resolved yet.
 Arguments = Mapping[str, Argument | float | None]
+# What kernels take for the numbers of Python.
+KERNEL_TYPES: dict[type, Any] = {float: np.float32, np.float64: np.float32, int: np.int32}
 
 
-def typed_arguments(arguments: Arguments) -> dict[str, Argument]:
+def typed_arguments(arguments: Arguments) -> dict[str, Any]:
     """Return kernel arguments in the types that kernels take.
 
-    >>> typed_arguments({"gain": 0.5, "count": np.uint32(3)})
-    {'gain': np.float32(0.5), 'count': np.uint32(3)}
+    >>> typed_arguments({"gain": 0.5, "size": 7, "count": np.uint32(3)})
+    {'gain': np.float32(0.5), 'size': np.int32(7), 'count': np.uint32(3)}
     """
-    typed: dict[str, Any] = {name: v for name, v in arguments.items() if v is not None}
-    floats = {name: float32(v) for name, v in typed.items() if is_float(v)}
-    return typed | floats
+    typed: dict[str, Any] = {}
+    for name, value in arguments.items():
+        if value is not None:
+            kernel_type = KERNEL_TYPES.get(type(value_of(value)))
+            typed[name] = call(kernel_type, value) if kernel_type else value
+    return typed
 
 
 def bytes_of(argument: Argument) -> bytes:

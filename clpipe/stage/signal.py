@@ -194,9 +194,7 @@ class NumpyBackend(Backend):
 
     def uniform(self) -> Signal:
         zero = np.zeros((1, 1), np.uint32)
-        word = philox(
-            zero, zero, zero, np.full((1, 1), self._stream.stage, np.uint32), self._stream
-        )[0]
+        word, *_ = philox(zero, 0, 0, self._stream.stage, self._stream)
         return upper_bits(word).astype(np.float32) * np.float32(4.6566129e-10)
 
     def rows(self) -> Signal:

@@ -5,22 +5,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
-    Arguments,
     Backend,
     Context,
-    Kind,
     LineTable,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
-    parameter,
+    camera_parameter,
+    sensor_stage,
 )
 
 SINE = tuple(map(np.float32, (42.058693, -76.705859, 81.605249, -41.341702, 6.2831853)))
@@ -61,11 +57,11 @@ class Sine(SignalMethod):
     summary: ClassVar = "add a sine wave over the rows, with a new phase in each image"
     example: ClassVar = {"amplitude": 0.01, "period": 9.7}
 
-    amplitude: float | None = parameter(
-        None, "Amplitude of the wave.", "signal", "from the camera and ISO", ge=0, le=1
+    amplitude: float | None = camera_parameter(
+        "Amplitude of the wave.", "signal", more=" and ISO", ge=0, le=1
     )
-    period: float | None = parameter(
-        None, "Period of the wave.", "rows", "from the camera; else 16", ge=2, le=1e5
+    period: float | None = camera_parameter(
+        "Period of the wave.", "rows", more="; else 16", ge=2, le=1e5
     )
 
     def resolve(self, context: Context) -> "Sine":
@@ -83,13 +79,10 @@ class Sine(SignalMethod):
         )
 
     @property
-    def frequency(self) -> np.float32:
+    def frequency(self) -> float:
         """The frequency of the wave, in turns per row."""
         assert self.period is not None
-        return float32(1 / self.period)
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"frequency": self.frequency, "amplitude": self.amplitude}
+        return 1 / self.period
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         return input_variance + np.float32(self.amplitude) ** 2 / np.float32(2)
@@ -100,11 +93,4 @@ class Sine(SignalMethod):
         return y + sine_of_turns(turns, backend.where) * n["amplitude"]
 
 
-STAGE = Stage(
-    "banding",
-    "Add a periodic wave over the rows.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Sine,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("banding", "Add a periodic wave over the rows.", (Sine,))

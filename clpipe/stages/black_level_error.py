@@ -5,23 +5,21 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
     Backend,
     CompileTime,
     Context,
-    Kind,
     LineTable,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
+    camera_parameter,
     parameter,
+    sensor_stage,
 )
 
 Bias = tuple[float, float, float, float]
@@ -49,19 +47,17 @@ class Offsets(SignalMethod):
     )
     example: ClassVar = {"sigma": 0.01, "bias": [0.004, -0.002, 0.001, 0.003]}
 
-    sigma: float | None = parameter(
-        None,
+    sigma: float | None = camera_parameter(
         "Standard deviation of the offsets that change with each image.",
         "signal",
-        "from the camera and ISO",
+        more=" and ISO",
         ge=0,
         le=1,
     )
-    bias: Annotated[Bias, Field(strict=False)] | None = parameter(
-        None,
+    bias: Annotated[Bias, Field(strict=False)] | None = camera_parameter(
         "Fixed offsets of R, of G in the rows of R, of G in the rows of B, and of B.",
         "signal",
-        "from the camera and ISO",
+        more=" and ISO",
     )
 
     offset: float = parameter(0.0, "Offset of all colours.", "signal", ge=-1, le=1)
@@ -82,9 +78,9 @@ class Offsets(SignalMethod):
             Pass("black_level_error", arguments=("in_even", "in_odd")),
         )
 
-    def _bias_by_site(self, pattern: str) -> dict[tuple[int, int], np.float32]:
+    def _bias_by_site(self, pattern: str) -> dict[tuple[int, int], float]:
         """Return the fixed offset at a column and row of the filter array."""
-        offsets = (float32(bias + self.offset) for bias in self.bias or (0.0,) * 4)
+        offsets = (bias + self.offset for bias in self.bias or (0.0,) * 4)
         red, with_red, with_blue, blue = offsets
         green = with_red if "R" in pattern[:2] else with_blue
         other_green = with_blue if "R" in pattern[:2] else with_red
@@ -112,11 +108,6 @@ class Offsets(SignalMethod):
         return y + backend.tiled(cell)
 
 
-STAGE = Stage(
-    "black_level_error",
-    "Add an error of the black level to each colour.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Offsets,),
-    role=StageRole.SENSOR,
+STAGE = sensor_stage(
+    "black_level_error", "Add an error of the black level to each colour.", (Offsets,)
 )

@@ -2,21 +2,19 @@
 
 from typing import ClassVar
 
-from clpipe.base.numbers import float32
 from clpipe.stage import (
     Arguments,
     Backend,
     Context,
-    Kind,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     Stencil,
     Unchanged,
+    camera_parameter,
     parameter,
+    sensor_stage,
 )
 
 RADIUS = 16  # px
@@ -25,7 +23,6 @@ RADIUS = 16  # px
 class NoBlooming(Unchanged):
     """No blooming, for sensors that drain excess charge."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no blooming, for sensors that drain excess charge"
 
 
@@ -48,8 +45,8 @@ class Column(SignalMethod):
     summary: ClassVar = "charge above the full well flows along the column"
     example: ClassVar = {"full_signal": 0.4, "spill": 0.7}
 
-    full_signal: float | None = parameter(
-        None, "Signal of a full pixel.", "signal", "from the camera and ISO; else 1", gt=0, le=1e6
+    full_signal: float | None = camera_parameter(
+        "Signal of a full pixel.", "signal", more=" and ISO; else 1", gt=0, le=1e6
     )
     spill: float = parameter(
         0.7, "Share of the excess charge that each pixel passes on to the next one.", ge=0, lt=1
@@ -65,8 +62,8 @@ class Column(SignalMethod):
         return (Pass("blooming", Stencil(RADIUS), ("full", "first", "spill")),)
 
     def arguments(self, context: Context) -> Arguments:
-        first, spill = float32((1 - self.spill) / 2), float32(self.spill)
-        return {"full": self.full_signal, "first": first, "spill": spill}
+        first = (1 - self.spill) / 2
+        return {"full": self.full_signal, "first": first, "spill": self.spill}
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
@@ -79,11 +76,4 @@ class Column(SignalMethod):
         return backend.minimum(backend.minimum(y, full) + received, full)
 
 
-STAGE = Stage(
-    "blooming",
-    "Let charge overflow from full pixels.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (NoBlooming, Column),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("blooming", "Let charge overflow from full pixels.", (NoBlooming, Column))

@@ -11,14 +11,14 @@ from clpipe.camera.profile import IDENTITY, Camera, Matrix
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     Unchanged,
+    camera_parameter,
     parameter,
+    rgb_stage,
 )
 
 NAMES = tuple(f"{row}_{column}" for row in "rgb" for column in "rgb")
@@ -34,6 +34,10 @@ def as_tuples(value: Any) -> Any:
     if len(rows) != 3 or len(real) != 9:
         raise ValueError("expected three rows of three numbers: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]")
     return tuple(tuple(float(x) for x in row) for row in rows)
+
+
+OptionalMatrix = Annotated[Matrix, BeforeValidator(as_tuples)] | None
+FROM_CAMERA = "Three rows of three numbers, from camera RGB to linear sRGB."
 
 
 def apply_matrix(image: Floats, matrix: Floats) -> Floats:
@@ -65,7 +69,6 @@ def srgb_to_camera(camera: Camera) -> Doubles:
 class NoMatrix(Unchanged):
     """No matrix: colours do not change."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no matrix: colours do not change"
 
 
@@ -77,7 +80,7 @@ class FixedMatrix(Method):
     summary: ClassVar = "your own 3x3 matrix"
     example: ClassVar = {"matrix": [[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.55]]}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
+    matrix: OptionalMatrix = parameter(
         IDENTITY,
         "Three rows of three numbers. Each row makes the new red, green or blue from the old "
         "three.",
@@ -122,10 +125,8 @@ class AsShot(FixedMatrix):
     example: ClassVar = {}
     other_examples: ClassVar = ({"matrix": [[1.2, -0.2, 0.0], [0.0, 1.0, 0.0], [0.0, -0.5, 1.5]]},)
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from camera RGB to linear sRGB.",
-        auto="the inverse of the matrix that inverse_color_matrix used",
+    matrix: OptionalMatrix = parameter(
+        None, FROM_CAMERA, auto="the inverse of the matrix that inverse_color_matrix used"
     )
 
     def resolve(self, context: Context) -> "AsShot":
@@ -144,11 +145,7 @@ class CameraToSrgb(FixedMatrix):
     summary: ClassVar = "camera RGB to linear sRGB, for raw files of a camera"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from camera RGB to linear sRGB.",
-        auto="from the camera",
-    )
+    matrix: OptionalMatrix = camera_parameter(FROM_CAMERA)
 
     def resolve(self, context: Context) -> "CameraToSrgb":
         """Return the method with a matrix.
@@ -168,11 +165,9 @@ class CameraToSrgb(FixedMatrix):
         return self.with_defaults(matrix=as_tuples(inverse.tolist()))
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "color_matrix",
     "Convert the camera's colours to linear sRGB.",
-    Kind.RGB,
-    Kind.RGB,
     (AsShot, CameraToSrgb, FixedMatrix, NoMatrix),
     role=StageRole.COLOURS,
 )

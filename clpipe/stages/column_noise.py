@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from clpipe.stage import Context, Kind, NoiseScope, Stage, StageRole
+from clpipe.stage import Context, NoiseScope, StageRole, sensor_stage
 from clpipe.stages.row_noise import LineNoise
 
 
@@ -26,11 +26,6 @@ class Gaussian(LineNoise):
         return self.with_defaults(sigma=context.camera.column_noise(context.iso))
 
 
-STAGE = Stage(
-    "column_noise",
-    "Add an offset to each column.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Gaussian,),
-    role=StageRole.SENSOR_OFFSETS,
+STAGE = sensor_stage(
+    "column_noise", "Add an offset to each column.", (Gaussian,), role=StageRole.SENSOR_OFFSETS
 )

@@ -3,18 +3,15 @@
 from typing import ClassVar
 
 from clpipe.stage import (
-    Arguments,
     Backend,
     Context,
-    Kind,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
     Stencil,
-    parameter,
+    camera_parameter,
+    sensor_stage,
 )
 
 
@@ -38,13 +35,8 @@ class Neighbours(SignalMethod):
     summary: ClassVar = "give a share of each pixel's charge to its four neighbours"
     example: ClassVar = {"share": 0.02}
 
-    share: float | None = parameter(
-        None,
-        "Share of a pixel's charge that leaks to each of its four neighbours.",
-        "",
-        "from the camera",
-        ge=0,
-        le=0.2,
+    share: float | None = camera_parameter(
+        "Share of a pixel's charge that leaks to each of its four neighbours.", ge=0, le=0.2
     )
 
     def resolve(self, context: Context) -> "Neighbours":
@@ -53,9 +45,6 @@ class Neighbours(SignalMethod):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("crosstalk", Stencil(1), ("share",)),) if self.share else ()
 
-    def arguments(self, context: Context) -> Arguments:
-        return {"share": self.share}
-
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
         across = backend.tap(y, -1, 0) + backend.tap(y, 1, 0)
@@ -63,11 +52,4 @@ class Neighbours(SignalMethod):
         return y + ((across + down) - y * 4) * n["share"]
 
 
-STAGE = Stage(
-    "crosstalk",
-    "Let charge leak to neighbouring pixels.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Neighbours,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("crosstalk", "Let charge leak to neighbouring pixels.", (Neighbours,))

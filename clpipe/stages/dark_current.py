@@ -5,7 +5,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
@@ -18,10 +17,11 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
+    camera_parameter,
+    optics_parameter,
     parameter,
     sensor_bits,
+    sensor_stage,
 )
 
 
@@ -45,12 +45,10 @@ class Thermal(SignalMethod):
     summary: ClassVar = "add the shot noise and the fixed pattern of dark current"
     example: ClassVar = {"exposure_time": 30.0, "current": 3.0, "spread": 0.4, "per_electron": 4e-4}
 
-    exposure_time: float | None = parameter(
-        None,
+    exposure_time: float | None = optics_parameter(
         "Exposure time. 0 disables dark current.",
         "s",
-        "the camera's, from the exposure's EV; else 0",
-        optics=True,
+        more=", from the exposure's EV; else 0",
         ge=0,
         le=86400,
     )
@@ -62,36 +60,25 @@ class Thermal(SignalMethod):
         ge=-150,
         le=150,
     )
-    current: float | None = parameter(
-        None, "Dark current at the reference temperature.", "e-/s", "from the camera", ge=0, le=1e6
+    current: float | None = camera_parameter(
+        "Dark current at the reference temperature.", "e-/s", ge=0, le=1e6
     )
-    reference_temperature: float | None = parameter(
-        None,
-        "Reference temperature, at which the current was measured.",
-        "deg C",
-        "from the camera",
-        ge=-150,
-        le=150,
+    reference_temperature: float | None = camera_parameter(
+        "Reference temperature, at which the current was measured.", "deg C", ge=-150, le=150
     )
-    doubling: float | None = parameter(
-        None,
+    doubling: float | None = camera_parameter(
         "Temperature difference that doubles the current. With 0 it does not depend on "
         "temperature.",
         "K",
-        "from the camera; else 0",
+        more="; else 0",
         ge=0,
         le=1000,
     )
-    spread: float | None = parameter(
-        None,
-        "Variation between pixels: standard deviation over mean.",
-        "",
-        "from the camera",
-        ge=0,
-        le=1,
+    spread: float | None = camera_parameter(
+        "Variation between pixels: standard deviation over mean.", ge=0, le=1
     )
-    per_electron: float | None = parameter(
-        None, "Signal of one electron.", "signal/e-", "from the camera and ISO", gt=0, le=1
+    per_electron: float | None = camera_parameter(
+        "Signal of one electron.", "signal/e-", more=" and ISO", gt=0, le=1
     )
 
     def optics(self) -> Mapping[str, float]:
@@ -138,11 +125,11 @@ class Thermal(SignalMethod):
         )
 
     @property
-    def _charge(self) -> tuple[np.float32, np.float32, np.float32]:
+    def _charge(self) -> tuple[float, float, float]:
         """Return the mean charge, its deviation over pixels, and the signal of an electron."""
         assert self.spread is not None and self.per_electron is not None
         mean = self.electrons * self.per_electron
-        return float32(mean), float32(mean * self.spread), float32(self.per_electron)
+        return mean, mean * self.spread, self.per_electron
 
     def arguments(self, context: Context) -> Arguments:
         mean, spread, electron = self._charge
@@ -151,7 +138,7 @@ class Thermal(SignalMethod):
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         if not self.electrons:
             return input_variance
-        mean, spread, electron = self._charge
+        mean, spread, electron = map(np.float32, self._charge)
         return input_variance + (mean * electron + spread * spread)
 
     @classmethod
@@ -166,11 +153,6 @@ def charge_of_sensor(height: int, width: int, stream: Stream) -> Floats:
     return exponential_of(sensor_bits(height, width, stream)) - np.float32(1)
 
 
-STAGE = Stage(
-    "dark_current",
-    "Add the shot noise and fixed pattern of thermal charge.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Thermal,),
-    role=StageRole.SENSOR,
+STAGE = sensor_stage(
+    "dark_current", "Add the shot noise and fixed pattern of thermal charge.", (Thermal,)
 )

@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.numbers import float32
 from clpipe.base.reading import cached_by_mtime, read_errors
 from clpipe.base.types import Array, Floats
 from clpipe.reference.random import Stream, normal_of, philox
@@ -17,7 +16,6 @@ from clpipe.stage import (
     Backend,
     CompileTime,
     Context,
-    Kind,
     LineTable,
     Method,
     NoiseScope,
@@ -25,9 +23,9 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
+    camera_parameter,
     parameter,
+    sensor_stage,
 )
 
 # Each product multiplies a curve over the rows by a curve over the columns. Each of the two maps
@@ -56,12 +54,10 @@ def curve(count: int, number: int, per_px: np.float32, stream: Stream) -> Floats
         three * f2 + three * f - three * f3 + one,
         f3,
     )
-    zero = np.zeros(1, np.uint32)
-    stage, draw = np.full(1, stream.stage, np.uint32), np.full(1, number, np.uint32)
     total = np.zeros(count, np.float32)
     for k, weight in enumerate(weights):
         knot = (whole + k).astype(np.uint32)
-        total = total + normal_of(philox(knot, zero, draw, stage, stream)[0]) * weight
+        total = total + normal_of(philox(knot, 0, number, stream.stage, stream)[0]) * weight
     return np.asarray(total * np.float32(0.24078))
 
 
@@ -88,19 +84,14 @@ class Smooth(SignalMethod):
     )
     example: ClassVar = {"slope": 1e-5, "offset": 0.01, "length": 7.3}
 
-    slope: float | None = parameter(
-        None,
-        "Standard deviation of the map k.",
-        "signal per ISO",
-        "from the camera",
-        ge=0,
-        le=1,
+    slope: float | None = camera_parameter(
+        "Standard deviation of the map k.", "signal per ISO", ge=0, le=1
     )
-    offset: float | None = parameter(
-        None, "Standard deviation of the map b.", "signal", "from the camera", ge=0, le=1
+    offset: float | None = camera_parameter(
+        "Standard deviation of the map b.", "signal", ge=0, le=1
     )
-    length: float | None = parameter(
-        None, "Distance between the knots of the maps.", "px", "from the camera", ge=4, le=1e5
+    length: float | None = camera_parameter(
+        "Distance between the knots of the maps.", "px", ge=4, le=1e5
     )
 
     def resolve(self, context: Context) -> "Smooth":
@@ -130,15 +121,15 @@ class Smooth(SignalMethod):
             Pass("dark_shading", arguments=("slope", "offset", *tables)),
         )
 
-    def _amplitudes(self, iso: float) -> tuple[np.float32, np.float32]:
+    def _amplitudes(self, iso: float) -> tuple[float, float]:
         """The factors of the products in both maps that give the maps their standard deviations."""
         assert self.slope is not None and self.offset is not None
-        return float32(self.slope * iso / sqrt(2)), float32(self.offset / sqrt(2))
+        return self.slope * iso / sqrt(2), self.offset / sqrt(2)
 
     @property
-    def _per_px(self) -> np.float32:
+    def _per_px(self) -> float:
         assert self.length is not None
-        return float32(1 / self.length)
+        return 1 / self.length
 
     def arguments(self, context: Context) -> Arguments:
         slope, offset = self._amplitudes(context.iso)
@@ -151,8 +142,8 @@ class Smooth(SignalMethod):
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:
-        of_iso = backend.fixed(shading, lambda method, _: (method._per_px, 0))
-        fixed = backend.fixed(shading, lambda method, _: (method._per_px, PRODUCTS))
+        of_iso = backend.fixed(shading, lambda method, _: (np.float32(method._per_px), 0))
+        fixed = backend.fixed(shading, lambda method, _: (np.float32(method._per_px), PRODUCTS))
         return y + (of_iso * n["slope"] + fixed * n["offset"])
 
 
@@ -216,8 +207,8 @@ class File(SignalMethod):
     )
     offset_file: str | None = parameter(None, "Image of the map b, in DN.", "", "none", file=True)
     block: float = parameter(32.0, "Distance between the samples of the maps.", "px", ge=1, le=4096)
-    unit: float | None = parameter(
-        None, "DN that correspond to a signal of 1.", "DN", "from the camera", gt=0, le=1e6
+    unit: float | None = camera_parameter(
+        "DN that correspond to a signal of 1.", "DN", gt=0, le=1e6
     )
 
     @field_validator("slope_file", "offset_file")
@@ -245,8 +236,7 @@ class File(SignalMethod):
             return {}
         shading_map = self._map(context.iso)
         height, width = shading_map.shape
-        sizes = {"width": np.int32(width), "height": np.int32(height)}
-        return {"map": shading_map, **sizes, "per_px": 1 / self.block}
+        return {"map": shading_map, "width": width, "height": height, "per_px": 1 / self.block}
 
     def without_noise(self) -> Method | None:
         return None if self.passes() else self
@@ -291,11 +281,4 @@ def sample_positions(pixels: int, per_px: np.float32, count: int) -> tuple[Array
     return first, np.minimum(first + 1, count - 1), t - first.astype(np.float32)
 
 
-STAGE = Stage(
-    "dark_shading",
-    "Add smooth dark shading maps of the sensor.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Smooth, File),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("dark_shading", "Add smooth dark shading maps of the sensor.", (Smooth, File))

@@ -10,16 +10,14 @@ from clpipe.stage import (
     Arguments,
     Backend,
     Context,
-    Kind,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
-    parameter,
+    camera_parameter,
     sensor_bits,
+    sensor_stage,
 )
 
 RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
@@ -46,19 +44,14 @@ class Random(SignalMethod):
     summary: ClassVar = "make pixels at random positions of the sensor hot or dead"
     example: ClassVar = {"hot_share": 0.05, "hot_level": 0.3, "dead_share": 0.05}
 
-    hot_share: float | None = parameter(
-        None, "Share of the pixels that are hot.", "", "from the camera", ge=0, le=0.1
-    )
-    hot_level: float | None = parameter(
-        None,
+    hot_share: float | None = camera_parameter("Share of the pixels that are hot.", ge=0, le=0.1)
+    hot_level: float | None = camera_parameter(
         "Smallest extra signal of a hot pixel; the mean is twice as large.",
         "signal",
-        "from the camera and ISO; else 0.1",
+        more=" and ISO; else 0.1",
         ge=0,
     )
-    dead_share: float | None = parameter(
-        None, "Share of the pixels that are dead.", "", "from the camera", ge=0, le=0.1
-    )
+    dead_share: float | None = camera_parameter("Share of the pixels that are dead.", ge=0, le=0.1)
 
     def resolve(self, context: Context) -> "Random":
         camera = context.camera
@@ -84,8 +77,8 @@ class Random(SignalMethod):
     def arguments(self, context: Context) -> Arguments:
         hot_limit, dead_limit = self.limits()
         return {
-            "hot_limit": np.int32(hot_limit),
-            "dead_limit": np.int32(dead_limit),
+            "hot_limit": hot_limit,
+            "dead_limit": dead_limit,
             "hot_scale": 1 / max(hot_limit, 1),
             "hot_level": self.hot_level,
         }
@@ -112,11 +105,4 @@ def alive_pixels(height: int, width: int, stream: Stream, limit: int) -> Floats:
     return (sensor_bits(height, width, stream) <= limit).astype(np.float32)
 
 
-STAGE = Stage(
-    "defect_pixels",
-    "Make some pixels hot or dead.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Random,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("defect_pixels", "Make some pixels hot or dead.", (Random,))

@@ -15,15 +15,15 @@ from clpipe.stage import (
     Context,
     FocalLengthMethod,
     ImageLayer,
-    Kind,
     LayerMethod,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     Stencil,
     Unchanged,
+    optics_parameter,
     parameter,
+    rgb_stage,
 )
 
 MAX_RADIUS = 31  # px, radius of a disc
@@ -33,7 +33,6 @@ NO_SURFACE = ImageLayer("depth", np.full((1, 1), np.inf, np.float32))
 class InFocus(Unchanged):
     """No depth of field: everything is in focus."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "everything is in focus"
 
 
@@ -60,17 +59,11 @@ class ThinLens(FocalLengthMethod, LayerMethod):
     usual_layers: ClassVar = ("Depth", "Z", "ZDepth", "Distance")
     no_layer: ClassVar = NO_SURFACE
 
-    focal_length: float | None = parameter(
-        None,
-        "Focal length.",
-        "mm",
-        "the camera's, else from fx and the pixel pitch, else 50",
-        optics=True,
-        gt=0,
-        le=2000,
+    focal_length: float | None = optics_parameter(
+        "Focal length.", "mm", more=", else from fx and the pixel pitch, else 50", gt=0, le=2000
     )
-    f_number: float | None = parameter(
-        None, "f-number of the aperture.", "", "the camera's, else 2.8", optics=True, ge=0.5, le=64
+    f_number: float | None = optics_parameter(
+        "f-number of the aperture.", more=", else 2.8", ge=0.5, le=64
     )
     focus_distance: float | None = parameter(
         None,
@@ -225,11 +218,11 @@ class ThinLens(FocalLengthMethod, LayerMethod):
         radii, reach, taps = layer.derived.get(self, lambda: self._tables(layer.pixels))
         return {
             "radii": radii,
-            "columns": np.int32(radii.shape[1]),
-            "rows": np.int32(radii.shape[0]),
-            "reach": np.int32(reach),
+            "columns": radii.shape[1],
+            "rows": radii.shape[0],
+            "reach": reach,
             "taps": taps,
-            "count": np.int32(len(taps)),
+            "count": len(taps),
         }
 
     def _tables(self, depth: Floats) -> tuple[Floats, int, Floats]:
@@ -249,11 +242,6 @@ class ThinLens(FocalLengthMethod, LayerMethod):
         return defocus(image, radii, taps)
 
 
-STAGE = Stage(
-    "defocus",
-    "Blur surfaces that are out of focus.",
-    Kind.RGB,
-    Kind.RGB,
-    (InFocus, ThinLens),
-    role=StageRole.LENS,
+STAGE = rgb_stage(
+    "defocus", "Blur surfaces that are out of focus.", (InFocus, ThinLens), role=StageRole.LENS
 )

@@ -24,24 +24,22 @@ from clpipe.stage import (
     CompileTime,
     Context,
     FocalLengthMethod,
-    Kind,
     LensMethod,
     Method,
     Pass,
     PrincipalPointMethod,
     ReferenceContext,
     Resample,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 
 class NoDistortion(Unchanged):
     """No distortion."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no distortion"
 
 
@@ -303,11 +301,9 @@ class PtLens(LensfunDistortion):
         return Radial.of(1 - self.a - self.b - self.c, self.c, self.b, self.a)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "distortion",
     "Apply a lens's distortion and lateral colour.",
-    Kind.RGB,
-    Kind.RGB,
     (LensDistortion, NoDistortion, BrownConrady, Fisheye, Poly3, Poly5, PtLens),
     role=StageRole.LENS,
 )

@@ -6,14 +6,13 @@ from clpipe.stage import (
     Backend,
     Context,
     GaussianNoise,
-    Kind,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
-    Stage,
     StageRole,
     sensor_normals,
+    sensor_stage,
 )
 
 
@@ -45,11 +44,6 @@ class Gaussian(GaussianNoise):
         return y + backend.fixed(sensor_normals) * n["sigma"]
 
 
-STAGE = Stage(
-    "dsnu",
-    "Add a fixed offset to each pixel (DSNU).",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Gaussian,),
-    role=StageRole.SENSOR_OFFSETS,
+STAGE = sensor_stage(
+    "dsnu", "Add a fixed offset to each pixel (DSNU).", (Gaussian,), role=StageRole.SENSOR_OFFSETS
 )

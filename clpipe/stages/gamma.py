@@ -3,11 +3,10 @@
 from functools import lru_cache
 from typing import ClassVar
 
-from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 from clpipe.reference.curve import tabulate
 from clpipe.reference.transfer import srgb_curve
-from clpipe.stage import Curve, Kind, Stage, StageRole, parameter
+from clpipe.stage import Curve, Kind, Stage, StageRole, parameter, pure
 
 
 @pure

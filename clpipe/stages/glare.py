@@ -4,21 +4,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     Method,
     Pass,
     Pointwise,
     Reduction,
     ReferenceContext,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 STEPS, MOST = np.float32(4096), np.float32(256)  # of a sample that is summed; per unit of light
@@ -27,7 +25,6 @@ STEPS, MOST = np.float32(4096), np.float32(256)  # of a sample that is summed; p
 class NoGlare(Unchanged):
     """No glare."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no glare"
 
 
@@ -62,7 +59,7 @@ class Veil(Method):
         return Pass("glare_sample", means), spread
 
     def arguments(self, context: Context) -> Arguments:
-        return {"share": self.share, "kept": float32(1 - self.share)}
+        return {"share": self.share, "kept": 1 - self.share}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.share:
@@ -89,11 +86,6 @@ def mean_light(image: Floats) -> Floats:
     return np.array(means, np.float32)
 
 
-STAGE = Stage(
-    "glare",
-    "Scatter light over the image, like a lens.",
-    Kind.RGB,
-    Kind.RGB,
-    (NoGlare, Veil),
-    role=StageRole.LENS,
+STAGE = rgb_stage(
+    "glare", "Scatter light over the image, like a lens.", (NoGlare, Veil), role=StageRole.LENS
 )

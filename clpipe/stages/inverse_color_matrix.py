@@ -1,12 +1,10 @@
 """Inverse colour matrix: from linear sRGB to a camera's white-balanced RGB, for a render."""
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
-from pydantic import BeforeValidator
-
-from clpipe.camera.profile import IDENTITY, Matrix
-from clpipe.stage import Context, Kind, Stage, StageRole, parameter
-from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, as_tuples
+from clpipe.camera.profile import IDENTITY
+from clpipe.stage import Context, StageRole, camera_parameter, rgb_stage
+from clpipe.stages.color_matrix import FixedMatrix, NoMatrix, OptionalMatrix, as_tuples
 
 
 class SrgbToCamera(FixedMatrix):
@@ -21,10 +19,8 @@ class SrgbToCamera(FixedMatrix):
     summary: ClassVar = "linear sRGB to camera RGB, if the camera's matrix is known"
     example: ClassVar = {}
 
-    matrix: Annotated[Matrix, BeforeValidator(as_tuples)] | None = parameter(
-        None,
-        "Three rows of three numbers, from linear sRGB to camera RGB.",
-        auto="from the camera; else none",
+    matrix: OptionalMatrix = camera_parameter(
+        "Three rows of three numbers, from linear sRGB to camera RGB.", more="; else none"
     )
 
     def resolve(self, context: Context) -> "SrgbToCamera":
@@ -35,11 +31,9 @@ class SrgbToCamera(FixedMatrix):
         return self.with_defaults(matrix=as_tuples(context.camera.srgb_to_camera().tolist()))
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "inverse_color_matrix",
     "Convert linear sRGB to the camera's colours.",
-    Kind.RGB,
-    Kind.RGB,
     (SrgbToCamera, FixedMatrix, NoMatrix),
     role=StageRole.COLOURS_OF_LIGHT,
 )

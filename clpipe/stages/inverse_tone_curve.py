@@ -11,12 +11,11 @@ from clpipe.stage import (
     Arguments,
     Context,
     Curve,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     Unchanged,
+    rgb_stage,
 )
 from clpipe.stages import tone_curve
 from clpipe.stages.tone_curve import standard
@@ -121,10 +120,8 @@ class File(tone_curve.File):
     read: ClassVar = staticmethod(inverse_table)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "inverse_tone_curve",
     "Undo the tone curve of a photograph.",
-    Kind.RGB,
-    Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),
 )

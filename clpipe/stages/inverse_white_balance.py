@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage, StageRole
@@ -25,10 +24,10 @@ class Gains(CameraGains):
     any_array: ClassVar = True
 
     @property
-    def factors(self) -> tuple[np.float32, np.float32]:
+    def factors(self) -> tuple[float, float]:
         """The factors of red and blue."""
         red, blue = self.gains
-        return float32(1 / red), float32(1 / blue)
+        return 1 / red, 1 / blue
 
     def resolve(self, context: Context) -> CameraGains:
         resolved = super().resolve(context)
@@ -49,7 +48,7 @@ class Gains(CameraGains):
         return input_variance * by_site(signal.shape[:2], context.pattern, red, np.float32(1), blue)
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        red, blue = self.factors
+        red, blue = map(np.float32, self.factors)
         return image * by_site(image.shape, inputs.context.pattern, red, np.float32(1), blue)
 
 

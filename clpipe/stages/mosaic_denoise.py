@@ -5,7 +5,6 @@ from typing import ClassVar
 import numpy as np
 from pydantic import field_validator
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import by_site
 from clpipe.reference.image import tap
@@ -24,6 +23,7 @@ from clpipe.stage import (
     Stencil,
     odd_size,
     parameter,
+    typed_arguments,
 )
 from clpipe.stages.sensor_noise.model import read_noise_parameter, shot_noise_parameter
 
@@ -106,32 +106,25 @@ class NonLocalMeans(Method):
             Pass("with_gains", arguments=("pattern", "red_gain", "blue_gain"), reads=("filtered",)),
         )
 
-    def numbers(self, context: Context) -> dict[str, np.float32]:
-        """Return the run-time arguments of all passes, by name."""
+    def arguments(self, context: Context) -> Arguments:
         assert self.a is not None and self.b is not None
         red, blue = context.applied_gains
         offset = max(0.375 * self.a**2 + self.b, 1e-12)
         return {
-            "red_inverse": float32(1 / red),
-            "blue_inverse": float32(1 / blue),
-            "red_gain": float32(red),
-            "blue_gain": float32(blue),
-            "a": float32(self.a),
-            "offset": float32(offset),
-            "root_of_offset": float32(np.sqrt(offset)),
+            **super().arguments(context),
+            "reach": CompileTime(str(self.reach)),
+            "red_inverse": 1 / red,
+            "blue_inverse": 1 / blue,
+            "red_gain": red,
+            "blue_gain": blue,
+            "offset": offset,
+            "root_of_offset": np.sqrt(offset),
             "bias": bias_of(self.strength),
             "scale": decay_of(FACTOR * self.strength),
         }
 
-    def arguments(self, context: Context) -> Arguments:
-        return {
-            "pattern": context.cfa,
-            "reach": CompileTime(str(self.reach)),
-            **self.numbers(context),
-        }
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        n = self.numbers(inputs.context)
+        n = typed_arguments(self.arguments(inputs.context))
         shape, pattern = image.shape, inputs.context.pattern
         one = np.float32(1)
         sensor = image * by_site(shape, pattern, n["red_inverse"], one, n["blue_inverse"])

@@ -7,7 +7,6 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 from clpipe.reference.convolve import convolve, tap_radius, taps_of
 from clpipe.reference.turning import BILINEAR, CameraRotation
@@ -15,16 +14,17 @@ from clpipe.stage import (
     Arguments,
     Context,
     FocalLengthMethod,
-    Kind,
     Method,
     Pass,
     PrincipalPointMethod,
     ReferenceContext,
     Resample,
-    Stage,
     StageRole,
     Stencil,
+    optics_parameter,
     parameter,
+    pure,
+    rgb_stage,
 )
 
 MAX_LENGTH = 200.0  # px; the longest streak
@@ -99,14 +99,8 @@ class Linear(Method):
         ge=0,
         lt=45,
     )
-    fx: float | None = parameter(
-        None,
-        "Focal length, for the streak of a rotation.",
-        "px",
-        "the camera's",
-        optics=True,
-        gt=0,
-        le=1e6,
+    fx: float | None = optics_parameter(
+        "Focal length, for the streak of a rotation.", "px", gt=0, le=1e6
     )
 
     @model_validator(mode="after")
@@ -155,7 +149,7 @@ class Linear(Method):
     def arguments(self, context: Context) -> Arguments:
         if not self.pixels:
             return {}
-        return {"taps": self.taps, "count": np.int32(len(self.taps))}
+        return {"taps": self.taps, "count": len(self.taps)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return convolve(image, self.taps) if self.pixels else image
@@ -227,11 +221,9 @@ class Perspective(FocalLengthMethod, PrincipalPointMethod):
         return self.rotation_warp.reference(image) if self.rotation else image
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "motion_blur",
     "Blur by camera motion during the exposure.",
-    Kind.RGB,
-    Kind.RGB,
     (Linear, Perspective),
     role=StageRole.LENS,
 )

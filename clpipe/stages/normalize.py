@@ -6,7 +6,6 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.companding import apply_pieces, parse_knots, pieces_of
 from clpipe.stage import (
@@ -92,21 +91,24 @@ class Linear(SignalMethod):
     def next_context(self, context: Context) -> Context:
         if context.full_scale == 1 or context.white_level is None or context.black_level is None:
             return context
-        assert self.black_level is not None and self.white_level is not None
         full_range = context.white_level - context.black_level
-        return context.replace(full_scale=full_range / (self.white_level - self.black_level))
+        return context.replace(full_scale=full_range / self._range)
+
+    @property
+    def _range(self) -> float:
+        assert self.black_level is not None and self.white_level is not None
+        return self.white_level - self.black_level
+
+    @property
+    def scale(self) -> float:
+        """The signal of one DN."""
+        return 1 / self._range
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("normalize_levels", arguments=("black_level", "scale")),)
 
-    def arguments(self, context: Context) -> Arguments:
-        assert self.black_level is not None and self.white_level is not None
-        scale = float32(1 / (self.white_level - self.black_level))
-        return {"black_level": self.black_level, "scale": scale}
-
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
-        assert self.black_level is not None and self.white_level is not None
-        return input_variance * np.float32((self.white_level - self.black_level) ** -2)
+        return input_variance * np.float32(self._range**-2)
 
     @classmethod
     def apply(cls, y: Signal, n: Numbers, backend: Backend) -> Signal:

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import field_validator
 
 from clpipe.base.errors import ImageError
-from clpipe.base.numbers import int32, pure
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.convolve import NEGLIGIBLE, blur, convolve, tap_radius, taps_of
 from clpipe.stage import (
@@ -21,11 +20,12 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     Stencil,
     Unchanged,
     parameter,
+    pure,
+    rgb_stage,
 )
 from clpipe.stages.vignetting import relative_radius
 
@@ -323,12 +323,12 @@ class Lens(Method):
     def _even_arguments(self) -> Arguments:
         lines = self._separable_arguments
         if lines is None:
-            return {"taps": self._taps, "count": int32(len(self._taps))}
+            return {"taps": self._taps, "count": len(self._taps)}
         weights = half_line_spread(*lines)
         if len(weights) - 1 <= MAX_UNROLLED_RADIUS:
             return {"reach": CompileTime(str(len(weights) - 1)), "weights": weights}
         across, down = line_taps(*lines)
-        return {"across": across, "down": down, "count": int32(len(across))}
+        return {"across": across, "down": down, "count": len(across)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         resolved = self.resolve(inputs.context)
@@ -353,15 +353,12 @@ class Lens(Method):
 class NoBlur(Unchanged):
     """No blur: the image keeps the sharpness of the render."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no blur"
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "optical_blur",
     "Blur by the lens and by the filter before the sensor.",
-    Kind.RGB,
-    Kind.RGB,
     (Lens, NoBlur),
     role=StageRole.LENS,
 )

@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import float32
 from clpipe.base.reading import cached_by_mtime, parse_json, read_bytes
 from clpipe.base.types import Floats
 from clpipe.reference.correlated import correlated_normals, mixing
@@ -38,13 +37,8 @@ TABLE_SIZE = 256  # entries of the kernel's table
 UNKNOWN = "unknown"  # the ISO of images without a stated ISO, in a report
 RESOLVED_SIZE = 65  # entries of a measured curve in the resolved parameters, and so in the sidecar
 CHANNELS = Kind.DISPLAY.channels
-MIXING_NAMES = (
-    "green_red",
-    "green_green",
-    "blue_red",
-    "blue_green",
-    "blue_blue",
-)  # kernel arguments
+# Kernel arguments.
+MIXING_NAMES = ("green_red", "green_green", "blue_red", "blue_green", "blue_blue")
 
 Sigma = Annotated[float, Field(ge=0, le=1)]
 Sigmas = Annotated[tuple[Sigma, ...], Field(strict=False, min_length=2, max_length=TABLE_SIZE)]
@@ -69,7 +63,6 @@ class NoiseMatching(Method):
 class NoNoise(Unchanged, NoiseMatching):
     """No noise on the finished image; with ``clpipe run --truth iid``, how to match the noise."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no noise on the finished image"
 
     jpeg: bool = parameter(
@@ -212,7 +205,7 @@ class IidGaussian(IndependentNoise):
 
     def arguments(self, context: Context) -> Arguments:
         assert self.sigma is not None
-        sigmas = zip(("red", "green", "blue"), map(float32, self.sigma), strict=True)
+        sigmas = zip(("red", "green", "blue"), self.sigma, strict=True)
         return {**dict(sigmas), **self.mixing_arguments()}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:

@@ -9,15 +9,13 @@ from clpipe.stage import (
     Backend,
     Context,
     GaussianNoise,
-    Kind,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
-    Stage,
-    StageRole,
-    parameter,
+    camera_parameter,
     sensor_normals,
+    sensor_stage,
 )
 
 
@@ -35,13 +33,8 @@ class Gaussian(GaussianNoise):
     kernel: ClassVar = "prnu"
     summary: ClassVar = "multiply each pixel by a sensitivity, the same in every image of a camera"
 
-    sigma: float | None = parameter(
-        None,
-        "Standard deviation of the sensitivities; their mean is 1.",
-        "",
-        "from the camera",
-        ge=0,
-        le=0.5,
+    sigma: float | None = camera_parameter(
+        "Standard deviation of the sensitivities; their mean is 1.", ge=0, le=0.5
     )
 
     def resolve(self, context: Context) -> "Gaussian":
@@ -59,11 +52,4 @@ class Gaussian(GaussianNoise):
         return y * (backend.fixed(sensor_normals) * n["sigma"] + 1)
 
 
-STAGE = Stage(
-    "prnu",
-    "Vary the sensitivity of pixels (PRNU).",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Gaussian,),
-    role=StageRole.SENSOR,
-)
+STAGE = sensor_stage("prnu", "Vary the sensitivity of pixels (PRNU).", (Gaussian,))

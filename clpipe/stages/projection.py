@@ -19,16 +19,15 @@ from clpipe.reference.wide import WideLens
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
     Resample,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
     principal_point_parameter,
+    rgb_stage,
 )
 from clpipe.stages.distortion import filter_arguments
 
@@ -36,7 +35,6 @@ from clpipe.stages.distortion import filter_arguments
 class NoProjection(Unchanged):
     """The image keeps the render's perspective."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "keep the render's perspective"
 
 
@@ -267,11 +265,9 @@ METHODS: tuple[type[Method], ...] = (
     FTheta,
 )
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "projection",
     "Make a wide-angle image from a render of the whole surroundings.",
-    Kind.RGB,
-    Kind.RGB,
     METHODS,
     role=StageRole.VIEW,
 )

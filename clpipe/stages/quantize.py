@@ -7,13 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.types import Floats
-from clpipe.reference.companding import (
-    Knots,
-    apply_pieces,
-    default_knots,
-    parse_knots,
-    pieces_of,
-)
+from clpipe.reference.companding import Knots, apply_pieces, default_knots, parse_knots, pieces_of
 from clpipe.stage import (
     Arguments,
     Backend,
@@ -27,6 +21,7 @@ from clpipe.stage import (
     SignalMethod,
     Stage,
     StageRole,
+    camera_parameter,
     parameter,
 )
 
@@ -58,11 +53,9 @@ class Linear(SignalMethod):
         ge=8,
         le=MAX_BITS,
     )
-    black_level: float | None = parameter(
-        None, "DN without light.", "DN", "from the camera", ge=0, le=MAX_DN
-    )
-    white_level: float | None = parameter(
-        None, "DN at full scale; more light clips.", "DN", "from the camera", gt=0, le=MAX_DN
+    black_level: float | None = camera_parameter("DN without light.", "DN", ge=0, le=MAX_DN)
+    white_level: float | None = camera_parameter(
+        "DN at full scale; more light clips.", "DN", gt=0, le=MAX_DN
     )
 
     @model_validator(mode="after")

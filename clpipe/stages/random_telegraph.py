@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32, int32
 from clpipe.base.types import Floats
 from clpipe.reference.random import Stream, exponential_of
 from clpipe.stage import (
@@ -17,10 +16,9 @@ from clpipe.stage import (
     Pass,
     Signal,
     SignalMethod,
-    Stage,
-    StageRole,
-    parameter,
+    camera_parameter,
     sensor_bits,
+    sensor_stage,
 )
 
 RANDOM_WORDS = 1 << 31  # number of different random words that choose the pixels
@@ -47,16 +45,9 @@ class TwoLevels(SignalMethod):
     summary: ClassVar = "a share of the pixels jumps between two levels"
     example: ClassVar = {"share": 0.05, "amplitude": 0.05}
 
-    share: float | None = parameter(
-        None, "Share of the pixels that jump.", "", "from the camera", ge=0, le=0.1
-    )
-    amplitude: float | None = parameter(
-        None,
-        "Mean distance between the two levels.",
-        "signal",
-        "from the camera and ISO",
-        ge=0,
-        le=1,
+    share: float | None = camera_parameter("Share of the pixels that jump.", ge=0, le=0.1)
+    amplitude: float | None = camera_parameter(
+        "Mean distance between the two levels.", "signal", more=" and ISO", ge=0, le=1
     )
 
     def resolve(self, context: Context) -> "TwoLevels":
@@ -79,16 +70,10 @@ class TwoLevels(SignalMethod):
             Pass("telegraph", reads=("levels",), random=NoiseScope.IMAGE),
         )
 
-    @property
-    def _limit_and_scale(self) -> tuple[np.int32, np.float32]:
-        """Return the words below which a pixel is chosen, and 1 over their number."""
-        assert self.share is not None
-        limit = round(self.share * RANDOM_WORDS)
-        return int32(limit), float32(1 / max(limit, 1))
-
     def arguments(self, context: Context) -> Arguments:
-        limit, scale = self._limit_and_scale
-        return {"limit": limit, "scale": scale, "amplitude": self.amplitude}
+        assert self.share is not None
+        limit = round(self.share * RANDOM_WORDS)  # the words below it choose a pixel
+        return {"limit": limit, "scale": 1 / max(limit, 1), "amplitude": self.amplitude}
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         """The mean variance over the sensor: share * E[A^2] / 4, E[A^2] = 2 amplitude^2."""
@@ -109,11 +94,8 @@ def levels_of_sensor(height: int, width: int, stream: Stream, share: float) -> F
     return np.where(bits < limit, exponential_of(bits, limit), np.float32(0))
 
 
-STAGE = Stage(
+STAGE = sensor_stage(
     "random_telegraph",
     "Add random telegraph noise: some pixels jump between two levels.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
     (TwoLevels,),
-    role=StageRole.SENSOR,
 )

@@ -5,7 +5,7 @@ from typing import ClassVar
 from clpipe.base.types import Floats
 from clpipe.reference.geometry import Scaling
 from clpipe.reference.resample import Resampling, Weight, lanczos3, overlap, resample
-from clpipe.stage import Kind, Method, Pass, ReferenceContext, Resample, Stage, parameter
+from clpipe.stage import Kind, Method, Pass, ReferenceContext, Resample, parameter, rgb_stage
 
 
 class Filter(Method):
@@ -78,11 +78,4 @@ class Lanczos3(Filter):
     filter: ClassVar = (lanczos3, 3.0)
 
 
-STAGE = Stage(
-    "resize",
-    "Reduce the image size.",
-    Kind.RGB,
-    Kind.RGB,
-    (Area, Lanczos3),
-    also_reads=(Kind.DISPLAY,),
-)
+STAGE = rgb_stage("resize", "Reduce the image size.", (Area, Lanczos3), also_reads=(Kind.DISPLAY,))

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, Stage
+from clpipe.stage import Context, Pass, ReferenceContext, rgb_stage
 from clpipe.stages.white_balance.gains import CameraGains, gain_parameter
 
 
@@ -39,10 +38,6 @@ class Brooks2019(CameraGains):
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("restore_highlights", arguments=("red_gain", "blue_gain")),)
 
-    def arguments(self, context: Context) -> Arguments:
-        red, blue = map(float32, self.gains)
-        return {"red_gain": red, "blue_gain": blue}
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         one = np.float32(1)
         red, green, blue = np.moveaxis(image, -1, 0)
@@ -56,10 +51,8 @@ class Brooks2019(CameraGains):
         return np.stack([raised[0], green, raised[1]], axis=-1)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "restore_highlights",
     "Restore red and blue in the clipped highlights of a photograph.",
-    Kind.RGB,
-    Kind.RGB,
     (Brooks2019,),
 )

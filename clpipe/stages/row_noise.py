@@ -9,14 +9,13 @@ from clpipe.stage import (
     Backend,
     Context,
     GaussianNoise,
-    Kind,
     LineTable,
     NoiseScope,
     Numbers,
     Pass,
     Signal,
-    Stage,
     StageRole,
+    sensor_stage,
 )
 
 
@@ -66,11 +65,6 @@ class Gaussian(LineNoise):
         return self.with_defaults(sigma=context.camera.row_noise(context.iso))
 
 
-STAGE = Stage(
-    "row_noise",
-    "Add an offset to each row.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
-    (Gaussian,),
-    role=StageRole.SENSOR_OFFSETS,
+STAGE = sensor_stage(
+    "row_noise", "Add an offset to each row.", (Gaussian,), role=StageRole.SENSOR_OFFSETS
 )

@@ -5,7 +5,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.numbers import pure
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr
 from clpipe.reference.image import tap
@@ -18,10 +17,11 @@ from clpipe.stage import (
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     Stencil,
     Unchanged,
     parameter,
+    pure,
+    rgb_stage,
 )
 from clpipe.stages.denoise.strength import (
     MID_GREY,
@@ -129,15 +129,9 @@ class Unsharp(Method):
         )
 
     def arguments(self, context: Context) -> Arguments:
-        return {
-            "reach": CompileTime(str(self.reach)),
-            "step": CompileTime(str(blur_step(self.radius))),
-            "weights": blur_weights(self.radius),
-            "amount": self.amount,
-            "threshold": self.threshold,
-            "limit": self.limit,
-            "offset": self.offset,
-        }
+        reach, step = (CompileTime(str(n)) for n in (self.reach, blur_step(self.radius)))
+        weights = blur_weights(self.radius)
+        return {**super().arguments(context), "reach": reach, "step": step, "weights": weights}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.amount:
@@ -166,14 +160,7 @@ def _blurred_along(plane: Floats, radius: float, step: tuple[int, int]) -> Float
 class NoSharpening(Unchanged):
     """No sharpening."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no sharpening"
 
 
-STAGE = Stage(
-    "sharpen",
-    "Sharpen luma, like a camera.",
-    Kind.RGB,
-    Kind.RGB,
-    (Unsharp, NoSharpening),
-)
+STAGE = rgb_stage("sharpen", "Sharpen luma, like a camera.", (Unsharp, NoSharpening))

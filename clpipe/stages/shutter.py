@@ -1,32 +1,27 @@
 """The exposure of each row of the sensor: a rolling shutter, and flickering lamps."""
 
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from clpipe.base.numbers import float32, pure
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import (
     Arguments,
     Context,
-    Kind,
     LineTable,
     Method,
     Pass,
     ReferenceContext,
     Span,
-    Stage,
     StageRole,
+    optics_parameter,
     parameter,
+    rgb_stage,
+    typed_arguments,
 )
-
-
-@pure
-def _sinc(x: float) -> float:
-    return float(np.sinc(x))
 
 
 class Rows(Method):
@@ -70,14 +65,8 @@ class Rows(Method):
         ge=1,
         le=10_000,
     )
-    exposure_time: float | None = parameter(
-        None,
-        "Exposure time of each row.",
-        "s",
-        "the camera's, else 0.01",
-        optics=True,
-        gt=0,
-        le=3600,
+    exposure_time: float | None = optics_parameter(
+        "Exposure time of each row.", "s", more=", else 0.01", gt=0, le=3600
     )
     line_time: float = parameter(
         0.0,
@@ -228,7 +217,7 @@ class Rows(Method):
     def swing(self) -> float:
         """The amplitude of the flicker after averaging over a row's exposure."""
         if not self.flicker_duty:
-            return self.depth * _sinc(self.cycles)
+            return self.depth * np.sinc(self.cycles)
         return self.depth * (1 - self.flicker_duty) * (self.cycles % 1) / self.cycles
 
     def passes(self) -> tuple[Pass, ...]:
@@ -247,22 +236,22 @@ class Rows(Method):
         start = self.flicker_frequency * self._first_exposure * self._span.start
         start += self.flicker_phase / 360 - self.margins.top * step  # the image's first row
         if not self.flicker_duty:
-            middle = float32((start + self.cycles / 2) % 1)
-            return {"step": float32(step), "start": middle, "swing": float32(self.swing)}
+            middle = (start + self.cycles / 2) % 1
+            return {"step": step, "start": middle, "swing": self.swing}
         whole = float(np.floor(self.cycles))
         return {
             "step": _phase_word(step),
             "start": _phase_word(start),
-            "rest": float32(self.cycles - whole),
-            "duty": float32(self.flicker_duty),
-            "steady": float32(1 - self.depth + self.depth * whole / self.cycles),
-            "scale": float32(self.depth / self.flicker_duty / self.cycles),
+            "rest": self.cycles - whole,
+            "duty": self.flicker_duty,
+            "steady": 1 - self.depth + self.depth * whole / self.cycles,
+            "scale": self.depth / self.flicker_duty / self.cycles,
         }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         if not self.passes():
             return image
-        n: Any = self.arguments(inputs.context)
+        n = typed_arguments(self.arguments(inputs.context))
         rows = np.arange(image.shape[0], dtype=np.uint32)
         if not self.flicker_duty:
             turns = rows.astype(np.float32) * n["step"] + n["start"]
@@ -285,11 +274,9 @@ def _phase_word(cycles: float) -> np.uint32:
     return np.uint32(round(cycles % 1 * 2**32) % 2**32)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "shutter",
     "Expose with a rolling shutter and flickering light.",
-    Kind.RGB,
-    Kind.RGB,
     (Rows,),
     role=StageRole.SHUTTER,
 )

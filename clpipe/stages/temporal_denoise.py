@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -15,15 +15,14 @@ from clpipe.stage import (
     CompileTime,
     Context,
     ImageLayer,
-    Kind,
     LayerMethod,
     Method,
     Noiseless,
     Pass,
     ReferenceContext,
-    Stage,
     Stencil,
     parameter,
+    rgb_stage,
     typed_arguments,
 )
 from clpipe.stages.denoise.strength import noise_of_colours
@@ -113,7 +112,7 @@ class Recursive(Method):
         if inputs.previous is None or self.frames == 1:
             return image
         previous = self.compensated(image, inputs.previous, inputs.context)
-        numbers: dict[str, Any] = typed_arguments(self.arguments(inputs.context))
+        numbers = typed_arguments(self.arguments(inputs.context))
         slope, offset = (
             np.array([numbers[f"{colour}_{item}"] for colour in COLOURS])
             for item in ("slope", "offset")
@@ -186,7 +185,7 @@ class OpticalFlow(Recursive, LayerMethod):
 
     def arguments(self, context: Context) -> Arguments:
         table = self.layer_in(context).pixels
-        columns, rows = np.int32(table.shape[2]), np.int32(table.shape[1])
+        rows, columns = table.shape[1:]
         return {**super().arguments(context), "flow": table, "columns": columns, "rows": rows}
 
     def compensated(self, image: Floats, previous: Floats, context: Context) -> Floats:
@@ -265,10 +264,8 @@ def best_match(
     return best, sums, before
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "temporal_denoise",
     "Reduce noise with the frames before, in a sequence.",
-    Kind.RGB,
-    Kind.RGB,
     (Recursive, BlockMatching, OpticalFlow),
 )

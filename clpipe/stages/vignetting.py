@@ -5,26 +5,23 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import Field
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.camera.lens import LensCalibration
 from clpipe.reference.math import inverse_root
 from clpipe.stage import (
-    Argument,
     Arguments,
     CompileTime,
     Context,
     FocalLengthMethod,
-    Kind,
     LensMethod,
     Method,
     Pass,
     PrincipalPointMethod,
     ReferenceContext,
-    Stage,
     StageRole,
     Unchanged,
     parameter,
+    rgb_stage,
 )
 
 Coefficient = Annotated[float, Field(ge=-100, le=100)]
@@ -33,7 +30,6 @@ Coefficient = Annotated[float, Field(ge=-100, le=100)]
 class NoVignetting(Unchanged):
     """No vignetting."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no vignetting"
 
 
@@ -76,10 +72,6 @@ class Pa(Method):
         if self.k1 == self.k2 == self.k3 == 0:
             return ()
         return (Pass("vignetting_pa", arguments=("extent", "k1", "k2", "k3")),)
-
-    def arguments(self, context: Context) -> Arguments:
-        coefficients = {name: float32(getattr(self, name)) for name in ("k1", "k2", "k3")}
-        return {"extent": CompileTime("e"), **coefficients}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         r2 = relative_radius(image)
@@ -129,15 +121,15 @@ class CosineFourth(FocalLengthMethod, PrincipalPointMethod):
         centre = {"x": _coordinate(self.cx, "width"), "y": _coordinate(self.cy, "height")}
         return {"extent": CompileTime("e"), **centre, "per_px": per_px, "per_side": per_side}
 
-    def _inverse_focal_squared(self) -> tuple[np.float32, np.float32]:
+    def _inverse_focal_squared(self) -> tuple[float, float]:
         """Return 1 over the squared focal length in px, or in longer sides; the other one is 0."""
         if self.fx:
-            return float32(self.fx**-2), float32(0)
+            return self.fx**-2, 0.0
         assert self.focal_length and self.sensor_width
-        return float32(0), float32((self.sensor_width / self.focal_length) ** 2)
+        return 0.0, (self.sensor_width / self.focal_length) ** 2
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        per_px, per_side = self._inverse_focal_squared()
+        per_px, per_side = map(np.float32, self._inverse_focal_squared())
         side: Floats = np.full(1, max(image.shape[:2]), np.float32)
         unit = per_px or per_side * _reciprocal(side * side)
         cosine = _reciprocal(_squared_radius(image, self.cx, self.cy) * unit + np.float32(1))
@@ -163,9 +155,9 @@ def _squared_radius(image: Floats, cx: float | None = None, cy: float | None = N
     return dx * dx + (dy * dy)[:, None]
 
 
-def _coordinate(centre: float | None, side: str) -> Argument:
+def _coordinate(centre: float | None, side: str) -> float | CompileTime:
     """Return a coordinate of the principal point; None is the centre, which a kernel computes."""
-    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else float32(centre)
+    return CompileTime(f"0.5f * (float)e.{side}") if centre is None else centre
 
 
 def _reciprocal(x: Floats) -> Floats:
@@ -173,11 +165,9 @@ def _reciprocal(x: Floats) -> Floats:
     return root * root
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "vignetting",
     "Darken the corners of the image, like a lens.",
-    Kind.RGB,
-    Kind.RGB,
     (LensVignetting, NoVignetting, Pa, CosineFourth),
     role=StageRole.FALLOFF,
 )

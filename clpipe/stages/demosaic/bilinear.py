@@ -6,7 +6,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
-from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, Stencil
+from clpipe.stage import Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -42,9 +42,6 @@ class Bilinear(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("bilinear", Stencil(1), ("pattern",)),)
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.cfa}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return bilinear(image, inputs.context.pattern)

@@ -4,7 +4,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
@@ -135,10 +134,10 @@ class Bounded(Method):
         )
 
     @property
-    def noise_margin(self) -> np.float32:
+    def noise_margin(self) -> float:
         """The noise that green may have, in roots: three sigma plus an invisible difference."""
         assert self.noise is not None and self.offset is not None
-        return float32(0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset))
+        return 0.01 + 3 * noise_in_roots(self.noise, MID_GREY, self.offset)
 
     def passes(self) -> tuple[Pass, ...]:
         return (
@@ -162,12 +161,8 @@ class Bounded(Method):
         )
 
     def arguments(self, context: Context) -> Arguments:
-        return {
-            "pattern": context.cfa,
-            "even": EQUAL_GRADIENT,
-            "noise": self.noise_margin,
-            "offset": self.offset,
-        }
+        known = super().arguments(context)
+        return {**known, "even": EQUAL_GRADIENT, "noise": self.noise_margin}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         pattern, offset = inputs.context.pattern, np.float32(self.offset)
@@ -176,7 +171,7 @@ class Bounded(Method):
         differences = spread_differences(known, pattern)
         red, green, blue = np.moveaxis(from_differences(roots, pattern, *differences), -1, 0)
         (red_low, blue_low), (red_high, blue_high) = bounds(
-            roots, known, green, pattern, self.noise_margin
+            roots, known, green, pattern, np.float32(self.noise_margin)
         )
         red, blue = np.clip(red, red_low, red_high), np.clip(blue, blue_low, blue_high)
         return from_root(in_steps(np.stack([red, green, blue], axis=-1)), offset)

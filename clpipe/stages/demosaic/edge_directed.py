@@ -8,17 +8,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import (
-    Arguments,
-    CompileTime,
-    Context,
-    Kind,
-    Method,
-    Pass,
-    ReferenceContext,
-    Stencil,
-    parameter,
-)
+from clpipe.stage import Kind, Method, Pass, ReferenceContext, Stencil, parameter
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -95,9 +85,6 @@ class EdgeDirected(Method):
             ),
             Pass("add_differences", Stencil(1), ("pattern",), reads=("src", "known")),
         )
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.cfa, "classifier": CompileTime(self.classifier.upper())}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         pattern = inputs.context.pattern

@@ -7,7 +7,7 @@ import numpy as np
 from clpipe.base.types import Floats
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, Stencil
+from clpipe.stage import Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import EIGHTH, HALF, red_and_blue, sum_of_corners
 
 TWO, FOUR, FIVE, SIX = np.float32(2), np.float32(4), np.float32(5), np.float32(6)
@@ -46,9 +46,6 @@ class Malvar2004(Method):
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("malvar2004", Stencil(2), ("pattern",)),)
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.cfa}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return malvar2004(image, inputs.context.pattern)

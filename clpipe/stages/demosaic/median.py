@@ -7,17 +7,7 @@ import numpy as np
 
 from clpipe.base.types import Floats
 from clpipe.reference.median import median_filter
-from clpipe.stage import (
-    Arguments,
-    CompileTime,
-    Context,
-    Kind,
-    Method,
-    Pass,
-    ReferenceContext,
-    Stencil,
-    parameter,
-)
+from clpipe.stage import Kind, Method, Pass, ReferenceContext, Stencil, parameter
 from clpipe.stages.demosaic.bilinear import bilinear
 from clpipe.stages.demosaic.common import from_differences, spread_differences
 from clpipe.stages.demosaic.edge_directed import EdgeDirected, green_or_difference
@@ -55,9 +45,6 @@ class Median(Method):
         arguments, reads = ("pattern", "size"), ("src", "spread")
         return Pass("freeman", Stencil(self.size // 2), arguments, reads)
 
-    def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.cfa, "size": CompileTime(str(self.size))}
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         pattern = inputs.context.pattern
         red, green, blue = np.moveaxis(bilinear(image, pattern), -1, 0)
@@ -86,9 +73,6 @@ class EdgeDirectedMedian(Median, EdgeDirected):
             kind=Kind.PAIR,
         )
         return green, spread, self.median_pass()
-
-    def arguments(self, context: Context) -> Arguments:
-        return {**EdgeDirected.arguments(self, context), **Median.arguments(self, context)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         pattern = inputs.context.pattern

@@ -12,7 +12,7 @@ import numpy as np
 from clpipe.base.types import Floats, Mask
 from clpipe.reference.cfa import Pattern, by_site
 from clpipe.reference.image import tap
-from clpipe.stage import Arguments, Context, Kind, Method, Pass, ReferenceContext, Stencil
+from clpipe.stage import Kind, Method, Pass, ReferenceContext, Stencil
 from clpipe.stages.demosaic.common import (
     HALF,
     QUARTER,
@@ -127,9 +127,6 @@ class Menon2007(Method):
             Pass("refine", Stencil(2), names, ("chosen",), writes="refined", kind=Kind.PAIR),
             Pass("interpolate", Stencil(2), names, ("src", "chosen", "refined")),
         )
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"pattern": context.cfa}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return menon2007(image, inputs.context.pattern)

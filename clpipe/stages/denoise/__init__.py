@@ -1,6 +1,6 @@
 """Denoising of luma and, more strongly, of chroma; the strength follows the predicted noise."""
 
-from clpipe.stage import Context, Kind, Stage, StageRole
+from clpipe.stage import Context, StageRole, rgb_stage
 from clpipe.stages.denoise import strength
 from clpipe.stages.denoise.bilateral import Bilateral
 from clpipe.stages.denoise.biweight import Biweight
@@ -16,12 +16,10 @@ def explain(context: Context) -> str:
     return "\n".join([strength.explain(context), *effects])
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "denoise",
     "Reduce noise in luma and chroma, like a camera.",
-    Kind.RGB,
-    Kind.RGB,
     METHODS,
-    explain,
     role=StageRole.DENOISING,
+    explain=explain,
 )

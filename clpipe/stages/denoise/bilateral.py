@@ -1,17 +1,24 @@
 """The bilateral filter."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import e, log2
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import smooth, tap
-from clpipe.stage import Context, Kind, Pass, ReferenceContext, Stencil, parameter
+from clpipe.stage import (
+    Arguments,
+    Context,
+    Kind,
+    Pass,
+    ReferenceContext,
+    Stencil,
+    parameter,
+    typed_arguments,
+)
 from clpipe.stages.denoise.strength import WindowDenoiser
 
 # Sigma of the range weight, in multiples of strength * noise, by the guide. The paper's images have
@@ -66,9 +73,10 @@ class Bilateral(WindowDenoiser):
         luma, chroma = (f"{self.range * amount:.3g}" for amount in self.amounts)
         return f"range sigma = {self.range:g} * strength * noise: luma {luma}, chroma {chroma}"
 
-    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+    def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.amounts
         return {
+            **super().arguments(context),
             "spatial_scale": gaussian_scale(self.spatial_sigma),
             "luma_scale": gaussian_scale(self.range * luma),
             "chroma_scale": gaussian_scale(self.range * chroma),
@@ -76,7 +84,7 @@ class Bilateral(WindowDenoiser):
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
-        numbers = self.numbers(inputs.context)
+        numbers = typed_arguments(self.arguments(inputs.context))
         luma, chroma = planes[..., :1], planes[..., 1:]
         near = numbers["spatial_scale"]
         guide = smooth(planes) if self.guide == "smooth" else planes
@@ -87,7 +95,7 @@ class Bilateral(WindowDenoiser):
 
 
 def bilateral(
-    planes: Floats, guide: Floats, reach: int, spatial_scale: np.float32, scale: np.float32
+    planes: Floats, guide: Floats, reach: int, spatial_scale: float, scale: float
 ) -> Floats:
     """Filter (height, width, plane) bilaterally by the guide's common distance (eq. 5 and 6).
 
@@ -111,6 +119,6 @@ def bilateral(
     return total / weights
 
 
-def gaussian_scale(sigma: float) -> np.float32:
+def gaussian_scale(sigma: float) -> float:
     """Return the factor c for which exp(-x^2 / (2 sigma^2)) = 2^(c * x^2)."""
-    return float32(-log2(e) / (2 * max(sigma, 1e-6) ** 2))
+    return -log2(e) / (2 * max(sigma, 1e-6) ** 2)

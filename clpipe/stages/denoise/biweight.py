@@ -1,7 +1,7 @@
 """Means weighted by Tukey's biweight, which leave grain like a camera's."""
 
 from collections.abc import Iterable
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from clpipe.reference.image import smooth, tap
 from clpipe.reference.roots import from_root, in_steps, noise_in_roots, root_of
 from clpipe.stage import (
     Arguments,
-    CompileTime,
     Context,
     Kind,
     Method,
@@ -181,14 +180,9 @@ class Biweight(Denoiser):
 
     def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.ranges
-        return {
-            "luma_range": luma,
-            "chroma_range": chroma,
-            "grain": self.grain if self.luma_strength else 1.0,
-            "luma_share": self.luma_share,
-            "chroma_scale": CompileTime(str(self.chroma_scale)),
-            "offset": self.offset,
-        }
+        grain = self.grain if self.luma_strength else 1.0
+        numbers = {"luma_range": luma, "chroma_range": chroma, "grain": grain}
+        return {**super().arguments(context), **numbers}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         ranges = np.array([self.ranges[0], *[self.ranges[1]] * 2], np.float32)
@@ -197,7 +191,7 @@ class Biweight(Denoiser):
         luma, guide = planes[..., :1], smooth(planes)
         chroma = guide[..., 1:]
         if not self.is_low_pass:
-            numbers: dict[str, Any] = typed_arguments(self.arguments(inputs.context))
+            numbers = typed_arguments(self.arguments(inputs.context))
             adjacent = [
                 (tap(luma, dx, dy), np.square(tap(guide[..., :1], dx, dy) - guide[..., :1]))
                 for dx, dy in ADJACENT

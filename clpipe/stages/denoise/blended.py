@@ -1,16 +1,14 @@
 """Mean and median: filters that ignore the noise, blended with the image according to it."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.median import median_filter
-from clpipe.stage import Context, ReferenceContext
+from clpipe.stage import Arguments, Context, ReferenceContext
 from clpipe.stages.denoise.strength import WindowDenoiser, size_parameter
 
 # Signal units; the assumed standard deviation of detail relative to its neighbours. We chose this
@@ -18,7 +16,7 @@ from clpipe.stages.denoise.strength import WindowDenoiser, size_parameter
 DETAIL = 0.02
 
 
-def blend_share(amount: float) -> np.float32:
+def blend_share(amount: float) -> float:
     """Return the share of the filtered image in the result: s^2 / (s^2 + t^2).
 
     Wiener's shrinkage (Lee, IEEE PAMI 1980) with the same standard deviation of detail, t = 0.02,
@@ -27,7 +25,7 @@ def blend_share(amount: float) -> np.float32:
     >>> [round(float(blend_share(s)), 2) for s in (0, 0.002, 0.01, 0.05)]
     [0.0, 0.01, 0.2, 0.86]
     """
-    return float32(amount**2 / (amount**2 + DETAIL**2))
+    return amount**2 / (amount**2 + DETAIL**2)
 
 
 class BlendedFilter(WindowDenoiser):
@@ -45,13 +43,17 @@ class BlendedFilter(WindowDenoiser):
         formula = f"share = s^2 / (s^2 + {DETAIL:g}^2), s = strength * noise"
         return f"{formula}: luma {luma}, chroma {chroma}"
 
-    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+    def arguments(self, context: Context) -> Arguments:
         luma, chroma = self.amounts
-        return {"luma_share": blend_share(luma), "chroma_share": blend_share(chroma)}
+        return {
+            **super().arguments(context),
+            "luma_share": blend_share(luma),
+            "chroma_share": blend_share(chroma),
+        }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         planes = rgb_to_ycbcr(image)
-        luma, chroma = (blend_share(amount) for amount in self.amounts)
+        luma, chroma = (np.float32(blend_share(amount)) for amount in self.amounts)
         y, c = planes[..., :1], planes[..., 1:]
         y = y + luma * (self.window(y, self.reaches[0]) - y)
         c = c + chroma * (self.window(c, self.reaches[1]) - c)

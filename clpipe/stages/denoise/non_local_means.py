@@ -1,17 +1,15 @@
 """Non-local means."""
 
-from collections.abc import Mapping
 from math import sqrt
 from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.reference.colour import rgb_to_ycbcr, ycbcr_to_rgb
 from clpipe.reference.image import tap
 from clpipe.reference.patch import bias_of, decay_of, patch_distances, patch_sum
-from clpipe.stage import Context, Kind, Pass, ReferenceContext
+from clpipe.stage import Arguments, Context, Kind, Pass, ReferenceContext, typed_arguments
 from clpipe.stages.denoise.strength import (
     MID_GREY,
     WindowDenoiser,
@@ -68,7 +66,7 @@ class NonLocalMeans(WindowDenoiser):
         luma, chroma = (f"{FACTOR * amount:.3g}" for amount in self.amounts)
         return f"h = {FACTOR:g} * strength * noise: luma {luma}, chroma {chroma}"
 
-    def numbers(self, context: Context) -> Mapping[str, np.float32]:
+    def arguments(self, context: Context) -> Arguments:
         assert self.luma_noise is not None and self.chroma_noise is not None
         # The squared distance of two patches is the mean of d^2 / sigma^2 over luma, chroma and the
         # patch. In these units it is a plain sum of squares.
@@ -79,10 +77,11 @@ class NonLocalMeans(WindowDenoiser):
         at_grey = variance.at(MID_GREY)
         slope, offset = variance.slope / at_grey, variance.offset / at_grey
         return {
-            "luma_unit": float32(luma_unit),
-            "chroma_unit": float32(chroma_unit),
-            "noise_slope": float32(slope * luma_unit / PATCH),
-            "noise_offset": float32(max(offset, 1e-6)),
+            **super().arguments(context),
+            "luma_unit": luma_unit,
+            "chroma_unit": chroma_unit,
+            "noise_slope": slope * luma_unit / PATCH,
+            "noise_offset": max(offset, 1e-6),
             "luma_bias": bias_of(self.luma_strength),
             "chroma_bias": bias_of(self.chroma_strength),
             "luma_scale": decay_of(FACTOR * self.luma_strength),
@@ -90,7 +89,7 @@ class NonLocalMeans(WindowDenoiser):
         }
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        n = self.numbers(inputs.context)
+        n = typed_arguments(self.arguments(inputs.context))
         units = np.array([n["luma_unit"], n["chroma_unit"], n["chroma_unit"]], np.float32)
         planes = rgb_to_ycbcr(image) / units
         level = np.maximum(patch_sum(planes[..., 0]), np.float32(0))

@@ -1,15 +1,13 @@
 """Exposure: the light that the sensor gets, set by a number, by metering or by physics."""
 
-from clpipe.stage import Kind, Stage, StageRole
+from clpipe.stage import StageRole, rgb_stage
 from clpipe.stages.exposure.auto import Auto
 from clpipe.stages.exposure.gain import Gain
 from clpipe.stages.exposure.photometric import Photometric
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "exposure",
     "Scale the light that the sensor gets.",
-    Kind.RGB,
-    Kind.RGB,
     (Gain, Auto, Photometric),
     role=StageRole.EXPOSURE,
 )

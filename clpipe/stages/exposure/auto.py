@@ -163,9 +163,9 @@ class Auto(Gain):
             "outside": np.uint32(outside),
             "delta": self.delta,
             "millionths": np.uint32(self._millionths),
-            "target": np.int32(round(np.log2(self.target) * STEPS)),
-            "lowest": np.int32(round(self.min_ev * STEPS)),
-            "highest": np.int32(round(self.max_ev * STEPS)),
+            "target": round(np.log2(self.target) * STEPS),
+            "lowest": round(self.min_ev * STEPS),
+            "highest": round(self.max_ev * STEPS),
             "offset": self.gain,
         }
 
@@ -182,7 +182,7 @@ class Auto(Gain):
             ev = min(max(ev, round(self.min_ev * STEPS)), round(self.max_ev * STEPS))
         stops = np.array([ev / STEPS], np.float32)
         whole, rest = power_of_two(stops)
-        (gain,) = (whole + whole * rest) * self.gain
+        (gain,) = (whole + whole * rest) * np.float32(self.gain)
         inputs.estimates["metered_ev"], inputs.estimates["gain"] = float(stops[0]), float(gain)
         return image * gain
 

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 
@@ -46,14 +45,14 @@ class Gain(Method):
 
     def gain_at(self, iso: float) -> float:
         """The value of a render's 1.0 over the sensor's full scale, without gain from metering."""
-        return float(self.factor(iso))
+        return float(np.float32(self.factor(iso)))
 
     @property
-    def gain(self) -> np.float32:
+    def gain(self) -> float:
         """The gain."""
-        return float32(2.0 ** (self.ev - self.headroom))
+        return 2.0 ** (self.ev - self.headroom)
 
-    def factor(self, iso: float) -> np.float32:
+    def factor(self, iso: float) -> float:
         """Return the value of one unit of a render, over the sensor's full scale, at an ISO."""
         return self.gain
 
@@ -64,4 +63,4 @@ class Gain(Method):
         return {"gain": self.factor(context.iso)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return image * self.factor(inputs.context.iso)
+        return image * np.float32(self.factor(inputs.context.iso))

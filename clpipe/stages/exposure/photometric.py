@@ -3,11 +3,8 @@
 import math
 from typing import ClassVar, Self
 
-import numpy as np
-
-from clpipe.base.numbers import float32
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
-from clpipe.stage import Context, parameter
+from clpipe.stage import Context, optics_parameter, parameter
 from clpipe.stages.exposure.gain import Gain
 
 SATURATION = 78.0  # lx s at ISO 1; the exposure that saturates the sensor
@@ -25,6 +22,7 @@ class Photometric(Gain):
     12.8 % of full scale and a white surface at 71 %. This half a stop is headroom, which tone_curve
     gives back. A meter with K = 12.5 (ISO 2720), N^2 / t = L S / K, exposes with q K / S = 8.1 / S.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> metered = Photometric(exposure_time=0.01, f_number=8.0)  # for L = 800 at ISO 100
     >>> round(run_reference(metered, np.full((1, 1, 3), 800, np.float32)).max().item(), 4)
@@ -43,11 +41,11 @@ class Photometric(Gain):
         ge=0,
         le=10,
     )
-    exposure_time: float | None = parameter(
-        None, "Exposure time, t.", "s", "the camera's, else 0.01", optics=True, gt=0, le=86400
+    exposure_time: float | None = optics_parameter(
+        "Exposure time, t.", "s", more=", else 0.01", gt=0, le=86400
     )
-    f_number: float | None = parameter(
-        None, "f-number of the lens, N.", "", "the camera's, else 8", optics=True, gt=0, le=1000
+    f_number: float | None = optics_parameter(
+        "f-number of the lens, N.", more=", else 8", gt=0, le=1000
     )
     q: float = parameter(
         0.65, "Share of the light that the lens and its geometry pass.", gt=0, le=math.pi / 4
@@ -71,7 +69,7 @@ class Photometric(Gain):
         headroom = context.headroom + self.headroom - math.log2(WHITE)
         return context.replace(headroom=headroom, exposure_time=self.time(self.exposure_time))
 
-    def factor(self, iso: float) -> np.float32:
+    def factor(self, iso: float) -> float:
         assert self.f_number and self.exposure_time
         exposure = self.q * self.scale * self.exposure_time / self.f_number**2  # lx s
-        return float32(exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom))
+        return exposure * iso / SATURATION * 2.0 ** (self.ev - self.headroom)

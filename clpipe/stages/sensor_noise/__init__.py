@@ -1,6 +1,6 @@
 """Sensor noise: shot noise and read noise."""
 
-from clpipe.stage import Kind, Stage, StageRole
+from clpipe.stage import StageRole, sensor_stage
 from clpipe.stages.sensor_noise.gaussian import Gaussian
 from clpipe.stages.sensor_noise.no_noise import NoNoise
 from clpipe.stages.sensor_noise.poisson import Poisson
@@ -9,11 +9,9 @@ from clpipe.stages.sensor_noise.skewed_gaussian import SkewedGaussian
 from clpipe.stages.sensor_noise.split_pixel import SplitDualGain, SplitPixel
 from clpipe.stages.sensor_noise.staggered import Staggered
 
-STAGE = Stage(
+STAGE = sensor_stage(
     "sensor_noise",
     "Add shot and read noise.",
-    Kind.MOSAIC,
-    Kind.MOSAIC,
     (SkewedGaussian, Gaussian, Poisson, DualGain, SplitPixel, SplitDualGain, Staggered, NoNoise),
     role=StageRole.SENSOR_NOISE,
 )

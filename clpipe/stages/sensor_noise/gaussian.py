@@ -4,9 +4,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
-from clpipe.stage import Backend, Context, NoiseScope, Numbers, Pass, Signal
+from clpipe.stage import Arguments, Backend, Context, NoiseScope, Numbers, Pass, Signal
 from clpipe.stages.sensor_noise.model import SensorNoise, unit_read_noise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, or_default
 
@@ -43,11 +42,11 @@ class Gaussian(SensorNoise):
             return np.maximum(self.added_variance(signal), np.float32(0)) + input_variance
         return super().variance(input_variance, signal, context)
 
-    def numbers(self) -> dict[str, np.float32]:
-        full = float32(or_default(self.full_signal, NEVER_FULL))
-        numbers = {"a": float32(self.a), "full_well": full}
+    def arguments(self, context: Context) -> Arguments:
+        full = or_default(self.full_signal, NEVER_FULL)
+        numbers = {"a": self.a, "full_well": full}
         if self.tukey_lambda is None:
-            return {**numbers, "b": float32(self.b)}
+            return {**numbers, "b": self.b}
         return {**numbers, **self.read_noise_numbers()}
 
     @classmethod

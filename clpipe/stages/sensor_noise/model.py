@@ -7,7 +7,6 @@ import numpy as np
 from pydantic import model_validator
 
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.camera.noise import Emva, NoiseModel, Paper
 from clpipe.reference.tukey_lambda import shape_and_scale
@@ -19,6 +18,7 @@ from clpipe.stage import (
     Numbers,
     Signal,
     SignalMethod,
+    camera_parameter,
     parameter,
 )
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
@@ -39,6 +39,11 @@ def read_noise_parameter(auto: str) -> Any:
     return parameter(None, text, "signal^2", auto, ge=0, le=1)
 
 
+def alternative(text: str, unit: str = "", **limits: Any) -> Any:
+    """Declare a parameter of a parametrisation that may replace a and b."""
+    return parameter(None, text, unit, "not used", **limits)
+
+
 class SensorNoise(SignalMethod):
     """The strength of the noise in one of three parametrisations, and the full well.
 
@@ -49,62 +54,38 @@ class SensorNoise(SignalMethod):
 
     a: float | None = shot_noise_parameter("from the camera and ISO")
     b: float | None = read_noise_parameter("from the camera and ISO")
-    system_gain: float | None = parameter(
-        None, "Instead of a: the system gain (EMVA 1288).", "DN/e-", "not used", gt=0
+    system_gain: float | None = alternative(
+        "Instead of a: the system gain (EMVA 1288).", "DN/e-", gt=0
     )
-    read_noise: float | None = parameter(
-        None,
-        "Instead of b: standard deviation of the noise before the gain (EMVA 1288).",
-        "e-",
-        "not used",
-        ge=0,
+    read_noise: float | None = alternative(
+        "Instead of b: standard deviation of the noise before the gain (EMVA 1288).", "e-", ge=0
     )
-    adc_noise: float | None = parameter(
-        None,
-        "With read_noise: standard deviation of the noise after the gain.",
-        "DN",
-        "not used",
-        ge=0,
+    adc_noise: float | None = alternative(
+        "With read_noise: standard deviation of the noise after the gain.", "DN", ge=0
     )
-    chi: float | None = parameter(
-        None,
+    chi: float | None = alternative(
         "Instead of a and b, with theta: electrons at y = 1 and theta = 1 (Bielova et al. 2019).",
         "e-",
-        "not used",
         gt=0,
     )
-    theta: float | None = parameter(
-        None, "With chi: the analogue gain (Bielova et al. 2019).", "", "not used", gt=0
-    )
-    b_before: float | None = parameter(
-        None,
+    theta: float | None = alternative("With chi: the analogue gain (Bielova et al. 2019).", gt=0)
+    b_before: float | None = alternative(
         "With chi: b', the variance of the noise before the gain (Bielova et al. 2019).",
         "signal^2",
-        "not used",
         ge=0,
     )
-    b_after: float | None = parameter(
-        None,
+    b_after: float | None = alternative(
         "With chi: b'', the variance of the noise after the gain (Bielova et al. 2019).",
         "signal^2",
-        "not used",
         ge=0,
     )
-    p0: float | None = parameter(
-        None, "With chi: the pedestal (Bielova et al. 2019).", "signal", "not used", ge=0
+    p0: float | None = alternative("With chi: the pedestal (Bielova et al. 2019).", "signal", ge=0)
+    full_well: float | None = camera_parameter(
+        "Largest number of electrons that a pixel holds.", "e-", more="; else no limit", gt=0
     )
-    full_well: float | None = parameter(
-        None,
-        "Largest number of electrons that a pixel holds.",
-        "e-",
-        "from the camera; else no limit",
-        gt=0,
-    )
-    tukey_lambda: float | None = parameter(
-        None,
+    tukey_lambda: float | None = camera_parameter(
         "Shape of the read noise: 0.14 is nearly Gaussian, and lower values have heavier tails.",
-        "",
-        "from the camera; else Gaussian",
+        more="; else Gaussian",
         gt=-0.5,
         le=1,
     )
@@ -193,17 +174,10 @@ class SensorNoise(SignalMethod):
         y = np.minimum(signal, np.float32(or_default(self.full_signal, NEVER_FULL)))
         return y * np.float32(self.a) + np.float32(self.b)
 
-    def numbers(self) -> dict[str, np.float32]:
-        """Return the kernel's arguments, by name."""
-        raise NotImplementedError(type(self).__name__)
-
-    def arguments(self, context: Context) -> Arguments:
-        return self.numbers()
-
-    def read_noise_numbers(self) -> dict[str, np.float32]:
+    def read_noise_numbers(self) -> Arguments:
         """Return the kernel's arguments for read noise: sigma and, if not Gaussian, its shape."""
         assert self.b is not None
-        sigma = {"read_noise": float32(self.b**0.5)}
+        sigma: Arguments = {"read_noise": self.b**0.5}
         if self.tukey_lambda is None:
             return sigma
         shape, scale = shape_and_scale(self.tukey_lambda)

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from clpipe.base.types import Floats
-from clpipe.stage import Arguments, Backend, Context, Numbers, Pass, Signal, SignalMethod, parameter
+from clpipe.stage import Backend, Context, Numbers, Pass, Signal, SignalMethod, camera_parameter
 
 NEVER_FULL = 1e30  # full well in electrons or signal units, for sensors that never saturate
 
@@ -27,12 +27,8 @@ class NoNoise(SignalMethod):
     summary: ClassVar = "no noise; the full well still clips"
     example: ClassVar = {"full_signal": 0.5}
 
-    full_signal: float | None = parameter(
-        None,
-        "Signal at which the well is full.",
-        "signal",
-        "from the camera and ISO; else no limit",
-        gt=0,
+    full_signal: float | None = camera_parameter(
+        "Signal at which the well is full.", "signal", more=" and ISO; else no limit", gt=0
     )
 
     def resolve(self, context: Context) -> "NoNoise":
@@ -42,9 +38,6 @@ class NoNoise(SignalMethod):
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("full_well", arguments=("full_signal",)),) if self.full_signal else ()
-
-    def arguments(self, context: Context) -> Arguments:
-        return {"full_signal": or_default(self.full_signal, NEVER_FULL)}
 
     def variance(self, input_variance: Floats, signal: Floats, context: Context) -> Floats:
         return input_variance

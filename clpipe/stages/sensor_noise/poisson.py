@@ -2,11 +2,8 @@
 
 from typing import ClassVar, Self
 
-import numpy as np
-
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import float32
-from clpipe.stage import Backend, Context, NoiseScope, Numbers, Pass, Signal
+from clpipe.stage import Arguments, Backend, Context, NoiseScope, Numbers, Pass, Signal
 from clpipe.stages.sensor_noise.model import SensorNoise, unit_read_noise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL
 
@@ -17,6 +14,7 @@ class Poisson(SensorNoise):
     Poisson numbers come from the inverse CDF (Giles, ACM TOMS 42(1), 2016). The read noise has the
     variance b and a Gaussian or, with ``tukey_lambda``, a Tukey lambda distribution.
 
+    >>> import numpy as np
     >>> from clpipe.stage import run_reference
     >>> noisy = run_reference(Poisson(a=1e-3, b=1e-4), np.full((300, 300), 0.5, np.float32))
     >>> round(float(noisy.mean()), 2), round(float(noisy.var()), 4)
@@ -51,12 +49,12 @@ class Poisson(SensorNoise):
             ),
         )
 
-    def numbers(self) -> dict[str, np.float32]:
+    def arguments(self, context: Context) -> Arguments:
         assert self.a
         return {
-            "chi": float32(1 / self.a),
-            "full_well": float32(self.full_well or NEVER_FULL),
-            "a": float32(self.a),
+            "chi": 1 / self.a,
+            "full_well": self.full_well or NEVER_FULL,
+            "a": self.a,
             **self.read_noise_numbers(),
         }
 

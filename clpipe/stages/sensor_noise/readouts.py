@@ -7,7 +7,6 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from clpipe.base.errors import RequestError
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.camera.profile import Camera
 from clpipe.reference.math import square_root
@@ -20,7 +19,9 @@ from clpipe.stage import (
     NoiseScope,
     Pass,
     ReferenceContext,
+    camera_parameter,
     parameter,
+    typed_arguments,
 )
 from clpipe.stages.sensor_noise.model import SensorNoise
 from clpipe.stages.sensor_noise.no_noise import NEVER_FULL, NoNoise, or_default
@@ -29,10 +30,7 @@ DEFAULT_RATIO = 16.0  # for sensors whose profile does not state a ratio
 MAX_READOUTS = 4
 # Signal of a readout at which its weight becomes 0, and the slope below it. The transition
 # therefore begins at 0.85.
-HANDOVER_END, HANDOVER_SLOPE = (
-    np.float32(0.95),
-    np.float32(10.0),
-)
+HANDOVER_END, HANDOVER_SLOPE = np.float32(0.95), np.float32(10.0)
 
 
 class Readout(NamedTuple):
@@ -69,17 +67,15 @@ class Readouts(SensorNoise):
 
     kernel: ClassVar = "sensor_noise_readouts"
 
-    ratio: float | None = parameter(
-        None,
+    ratio: float | None = camera_parameter(
         "Ratio of sensitivity between each readout and the next one.",
-        auto="from the camera; else 16",
+        more="; else 16",
         gt=1,
         le=1024,
     )
-    later_noise: float | None = parameter(
-        None,
+    later_noise: float | None = camera_parameter(
         "Read noise of the further readouts over that of the first, both in DN.",
-        auto="from the camera; else 1",
+        more="; else 1",
         ge=0,
         le=1000,
     )
@@ -157,14 +153,6 @@ class Readouts(SensorNoise):
     def full_signal(self) -> float | None:
         return self._full_signal if self._is_clean else super().full_signal
 
-    def numbers(self) -> dict[str, np.float32]:
-        return {
-            "a": float32(self.a),
-            "full_well": float32(or_default(self.full_signal, NEVER_FULL)),
-            "range": float32(self._signal_range),
-            "unit": float32(1 / self._signal_range),
-        }
-
     @property
     def table(self) -> Floats:
         """The readouts in the layout of the kernel: (readout, 5)."""
@@ -174,7 +162,14 @@ class Readouts(SensorNoise):
     def arguments(self, context: Context) -> Arguments:
         structure = {"count": len(self.readouts), "part": -1 if self.part is None else self.part}
         literals = {name: CompileTime(str(value)) for name, value in structure.items()}
-        return {**self.numbers(), **literals, "table": self.table}
+        return {
+            **literals,
+            "a": self.a,
+            "full_well": or_default(self.full_signal, NEVER_FULL),
+            "range": self._signal_range,
+            "unit": 1 / self._signal_range,
+            "table": self.table,
+        }
 
     def added_variance(self, signal: Floats) -> Floats:
         remaining, read = np.ones_like(signal), np.zeros_like(signal)
@@ -210,7 +205,7 @@ class Readouts(SensorNoise):
         def normals(draw: int) -> Floats:
             return normal_at(image.shape, draw, inputs.stream[NoiseScope.IMAGE])
 
-        n = self.numbers()
+        n = typed_arguments(self.arguments(inputs.context))
         values, weights = [], []
         photodiode, charge = -1, image
         for i, (number, share, gain, inverse, variance) in enumerate(self.table):

@@ -4,7 +4,7 @@ from typing import ClassVar, Self
 
 from clpipe.base.errors import RequestError
 from clpipe.camera.profile import Camera
-from clpipe.stage import parameter
+from clpipe.stage import camera_parameter
 from clpipe.stages.sensor_noise.readouts import Readout, Readouts
 
 DEFAULT_LIGHT_RATIO = 100.0  # for sensors whose profile does not state a ratio
@@ -19,11 +19,9 @@ class SplitPhotodiode(Readouts):
     small one takes over. The figures of the large one already include its loss.
     """
 
-    crosstalk: float | None = parameter(
-        None,
+    crosstalk: float | None = camera_parameter(
         "Charge that leaks into the small photodiode, over that of the large one.",
-        "",
-        "from the camera; else 0",
+        more="; else 0",
         ge=0,
         le=0.5,
     )
@@ -65,10 +63,9 @@ class SplitDualGain(SplitPhotodiode):
     method: ClassVar = "split_dual_gain"
     summary: ClassVar = "a large and a small photodiode, each read at two gains, merged"
 
-    light_ratio: float | None = parameter(
-        None,
+    light_ratio: float | None = camera_parameter(
         "Light that the large photodiode sees over that of the small one.",
-        auto="from the camera; else 100",
+        more="; else 100",
         gt=1,
         le=10_000,
     )

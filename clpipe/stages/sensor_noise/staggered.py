@@ -71,7 +71,7 @@ class Staggered(Readouts):
             return super().arguments(context)
         later = NO_IMAGES if self._later_images is None else self._later_images
         later = np.pad(later, ((0, 0), (0, 0), (0, LANES)))
-        rows, columns = (np.int32(size) for size in later.shape[1:])
+        rows, columns = later.shape[1:]
         return {**super().arguments(context), "later": later, "columns": columns, "rows": rows}
 
     def light_on(self, image: Floats, photodiode: int) -> Floats:

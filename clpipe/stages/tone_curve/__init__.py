@@ -6,19 +6,17 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import field_validator
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
+from clpipe.stage import Arguments as Arguments
 from clpipe.stage import (
-    Arguments,
     Context,
     Curve,
-    Kind,
     Method,
     Pass,
     ReferenceContext,
-    Stage,
     StageRole,
     parameter,
+    rgb_stage,
 )
 from clpipe.stages.tone_curve.neutral import Neutral
 from clpipe.stages.tone_curve.standard import Standard
@@ -57,19 +55,16 @@ class Linear(Method):
         return self.with_defaults(headroom=context.headroom)
 
     @property
-    def gain(self) -> np.float32:
+    def gain(self) -> float:
         """The gain."""
         assert self.headroom is not None
-        return float32(2.0**self.headroom)
+        return 2.0**self.headroom
 
     def passes(self) -> tuple[Pass, ...]:
         return (Pass("exposure", arguments=("gain",)),) if self.headroom else ()
 
-    def arguments(self, context: Context) -> Arguments:
-        return {"gain": self.gain}
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        return image * self.gain
+        return image * np.float32(self.gain)
 
 
 class File(Curve):
@@ -97,11 +92,9 @@ class File(Curve):
         return self.read(self.path)
 
 
-STAGE = Stage(
+STAGE = rgb_stage(
     "tone_curve",
     "Apply a tone curve with the contrast of a photograph.",
-    Kind.RGB,
-    Kind.RGB,
     (Standard, Neutral, CameraRaw, Linear, File),
     role=StageRole.RESPONSE,
 )

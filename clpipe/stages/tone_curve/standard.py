@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from clpipe.base.numbers import float32
 from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 from clpipe.stages.tone_curve.hue import clip_to_unit
@@ -80,8 +79,8 @@ class Standard(Method):
         return (Pass("standard", arguments=("a", "b", "c", "d", "saturation")),)
 
     def arguments(self, context: Context) -> Arguments:
-        named = dict(zip("abcd", map(float32, self.coefficients), strict=True))
-        return {**named, "saturation": float32(self.saturation)}
+        named = dict(zip("abcd", self.coefficients, strict=True))
+        return {**named, "saturation": self.saturation}
 
     def curve(self, x: Floats) -> Floats:
         """Apply the curve to values 0..1 of any shape."""

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr
 
-from clpipe.base.numbers import float32, int32
 from clpipe.base.types import Floats
 from clpipe.camera.lights import TOLERANCE, limited_to_lights, plausible_gains
 from clpipe.reference.cfa import Pattern, by_site
@@ -65,8 +64,8 @@ class EstimatedGains(Method):
         lights = plausible_gains(context.camera, context.gains)
         return {
             "lights": lights,
-            "light_count": int32(len(lights) if self.limit else 0),
-            "light_tolerance": float32(TOLERANCE),
+            "light_count": len(lights) if self.limit else 0,
+            "light_tolerance": TOLERANCE,
         }
 
     def gains(self, image: Floats, pattern: Pattern) -> tuple[np.float32, np.float32]:
@@ -166,10 +165,6 @@ class Gains(CameraGains):
     def passes(self) -> tuple[Pass, ...]:
         return (APPLY,)
 
-    def arguments(self, context: Context) -> Arguments:
-        red, blue = map(float32, self.gains)
-        return {"pattern": context.cfa, "red_gain": red, "blue_gain": blue}
-
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return apply_gains(image, inputs.context, *map(np.float32, self.gains))
 
@@ -207,6 +202,5 @@ class ArrayAsShot(ArrayMethod, AsShot):
 class Unbalanced(Unchanged):
     """No gains: after ``inverse_white_balance`` the mosaic keeps the sensor's own colours."""
 
-    method: ClassVar = "none"
     summary: ClassVar = "no gains"
     any_array: ClassVar = True

@@ -84,7 +84,7 @@ class WhitePatch(EstimatedGains):
         return {
             **super().arguments(context),
             "pattern": context.cfa,
-            "clip": np.float32(self.clip),
+            "clip": self.clip,
             "millionths": np.uint32(self._millionths),
         }
 
