@@ -1,6 +1,7 @@
 """The service: frames of any thread and kind give the results that each gives alone."""
 
 import gc
+import itertools
 import multiprocessing
 import threading
 import weakref
@@ -18,6 +19,7 @@ from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Runner
 from clpipe.engine.service import Frame, Service, picture
 from clpipe.stage import Kind
+from clpipe.stages import DEFAULT_CHAIN
 
 SIZES = [(24, 32), (1, 40), (40, 1), (37, 53), (24, 32), (700, 900)]
 GUARD = 60  # s
@@ -191,3 +193,59 @@ def test_plans_are_shared_by_structure(device):
     assert passes[0] == passes[1]
     wide, narrow = (Runner(chain, None, encode=False, final=True).plan() for chain in arrays)
     assert wide is not narrow
+
+
+@pytest.mark.parametrize("has_state", [False, True])
+def test_whether_a_pass_undoes_another_is_known_for_each_chain(has_state):
+    """Denoising takes the roots that demosaicing has left, if both have one offset."""
+    stages = [*DEFAULT_CHAIN]
+    if has_state:
+        stages.insert(stages.index("denoise"), "temporal_denoise")
+    settings = settings_from(
+        {
+            "stages": stages,
+            "demosaic": {"method": "bounded", "offset": 0.004},
+            "denoise": {"offset": {"choice": [0.004, 0.02]}},
+        }
+    )
+    plans = {}
+    for key in "abcdefghijkl":
+        chain = make_chain(settings.drawn(key))
+        plan, offset = Runner(chain, None).plan(), chain.step_named("denoise").method.offset
+        assert plans.setdefault(offset, plan) is plan
+    assert len(plans) == 2 and plans[0.004] is not plans[0.02]
+
+
+def test_a_device_that_fails_after_the_end_leaves_no_frame_waiting(device):
+    class Late(Broken):
+        def submit(self, works):
+            is_closing.wait(GUARD)
+            return super().submit(works)
+
+    is_closing = threading.Event()
+    service, (frame, *_) = Service([Late(device.info), Late(device.info)]), frames()
+    developments = [each for _ in range(2) for each in service.develop([frame])]
+    closer = threading.Thread(target=service.close)
+    closer.start()
+    is_closing.set()
+    closer.join(GUARD)
+    assert not closer.is_alive()
+    for development in developments:
+        with pytest.raises((ImageError, DeviceError)):
+            development.result(GUARD)
+
+
+def test_a_thread_that_cannot_start_ends_the_others(device, monkeypatch):
+    start, numbers = threading.Thread.start, itertools.count()
+
+    def starting(thread):
+        if next(numbers) == 1:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    service, (frame, *_) = Service([None, None]), frames()
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", starting)
+        with pytest.raises(RuntimeError, match="can't start"):
+            service.develop([frame])
+    service.develop([frame])[0].result(GUARD)

@@ -125,6 +125,8 @@ class Developing:
 
     def _start(self, ordered: list[tuple[JobState, Recipe, Frame, Files]]) -> None:
         """Develop frames together, if there are any, and empty the list."""
+        if not ordered:  # a run that skips all images starts no device
+            return
         developments = self.service.develop([frame for _, _, frame, _ in ordered])
         for development, (state, recipe, _, files) in zip(developments, ordered, strict=True):
             development.add_done_callback(partial(self._finish, state, recipe, files))
@@ -145,10 +147,14 @@ class Developing:
             result = self._worker.finish(state, recipe, development)
         except BaseException as problem:  # an error of an image must not end the thread
             state.fail(problem)
-        if result:
-            self._encoders.submit(self._encode, state, recipe, result, development.device, files)
-        else:
+        if not result:
             files.set_result(None)
+            return
+        arguments = state, recipe, result, development.device, files
+        try:
+            self._encoders.submit(self._encode, *arguments)
+        except RuntimeError:  # the system allows no more threads
+            self._encode(*arguments)
 
     def _encode(
         self, state: JobState, recipe: Recipe, result: Result, device: Device | None, files: Files

@@ -175,8 +175,12 @@ class Batch:
         Raises:
             RequestError: the system allows no more threads.
         """
-        with self._starting("device"):
-            self._renditions.begin()
+        try:
+            with self._starting("device"):
+                self._renditions.begin()
+        except RequestError as error:  # of the run, not of one image
+            self._fail(error)
+            raise
 
     def _queue(self, jobs: Iterable[Job]) -> None:
         """Queue all jobs, until the run stops."""

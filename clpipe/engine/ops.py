@@ -6,7 +6,7 @@ from enum import Enum
 
 import numpy as np
 
-from clpipe.chain.chain import Chain, Step
+from clpipe.chain.chain import Chain, Step, cached_by_structure
 from clpipe.stage import (
     PREVIOUS,
     Argument,
@@ -95,6 +95,39 @@ def chain_ops(
             last = ops[-1]
         steps.append((step.name, ops))
     return tuple(steps)
+
+
+@cached_by_structure
+def _inverse_pairs(chain: Chain, frame: FrameKind) -> tuple[tuple[str, Pass, str, Pass], ...]:
+    """Return the passes that may undo the pass before, and those passes, each with its step."""
+    found: list[tuple[str, Pass, str, Pass]] = []
+    last: tuple[str, Pass] | None = None
+    for step in chain.steps:
+        passes = step.passes
+        if not passes or (
+            frame is not FrameKind.LATER and any(PREVIOUS in each.reads for each in passes)
+        ):
+            continue
+        access = passes[0].access
+        if last and isinstance(access, Pointwise) and access.inverse_of == last[1].function:
+            found.append((step.name, passes[0], *last))
+        last = step.name, passes[-1]
+    return tuple(found)
+
+
+def undone(chain: Chain, frame: FrameKind) -> tuple[bool, ...]:
+    """Return which passes undo the pass before them.
+
+    This depends on numbers, so chains of one structure may differ in it, and so do their plans.
+    """
+    pairs = _inverse_pairs(chain, frame)
+    if not pairs:
+        return ()
+    arguments = chain.arguments
+    return tuple(
+        undoes(pass_, arguments[step], previous, arguments[earlier])
+        for step, pass_, earlier, previous in pairs
+    )
 
 
 def border_periods(chain: Chain) -> dict[str, tuple[int, int] | None]:

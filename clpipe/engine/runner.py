@@ -18,7 +18,7 @@ from clpipe.engine.buffers import HostImages, allocate_results, crop_patches, is
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box, whole_image
 from clpipe.engine.ir import Plan
-from clpipe.engine.ops import FrameKind, border_periods, chain_ops
+from clpipe.engine.ops import FrameKind, border_periods, chain_ops, undone
 from clpipe.engine.options import DEFAULTS, RunOptions
 from clpipe.engine.patches import check_sizes
 from clpipe.engine.plan import make_plan
@@ -141,7 +141,7 @@ class Runner:
         bands &= self.bands
         cpu = self.device.info.cpu if self.device and bands else None
         chain, results = self.chain, (self.keep, self.encode, self.final)
-        key = *results, half, fold, planar, cpu, frame
+        key = *results, half, fold, planar, cpu, frame, undone(chain, frame)
 
         def plan() -> Plan:
             ops = chain_ops(chain, chain.arguments, FrameKind.LATER)

@@ -15,6 +15,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
 from clpipe.base.cpu_time import CpuTimer
@@ -29,6 +30,7 @@ from clpipe.stage import Kind
 
 log = logging.getLogger(__name__)
 
+ENDED = "the run ended before this image was developed"
 MAX_STACK = 16  # the most small frames that share launches
 
 
@@ -130,6 +132,7 @@ class Service:
         self._process = os.getpid()
         self._frames: Frames = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
+        self._computing = threading.Lock()  # lets one thread use NumPy, which takes much memory
 
     @property
     def depth(self) -> int:
@@ -158,7 +161,12 @@ class Service:
         for number, device in enumerate(self.devices):
             server = _Server(device, self._frames, spare, self._prepare)
             thread = threading.Thread(target=server.run, name=f"device {number}", daemon=True)
-            thread.start()
+            try:
+                thread.start()
+            except RuntimeError:  # the system allows no more threads
+                _end(self._frames, len(self._threads))
+                self._reset()
+                raise
             self._threads.append(thread)
         SERVICES.add(self)
         weakref.finalize(self, _end, self._frames, len(self._threads)).atexit = False
@@ -171,12 +179,13 @@ class Service:
         """
         developments = [Development(frame) for frame in frames]
         with self._lock:
-            self._start()
+            if developments:
+                self._start()
             if developments and not self._is_closed:
                 self._frames.put(developments)
                 return developments
         for development in developments:
-            development.set_exception(ImageError("the run ended before this image was developed"))
+            development.set_exception(ImageError(ENDED))
         return developments
 
     def run(self, frame: Frame) -> Result:
@@ -191,7 +200,10 @@ class Service:
         device, *others = self.devices
         if others or self._is_closed or self._prepare is not no_preparation:
             return self.develop([frame])[0].result()
-        return frame.runner(device).run(frame.pixels, frame.noise_key, frame.options)
+        if self._process != os.getpid():
+            self._reset()
+        with nullcontext() if device else self._computing:
+            return frame.runner(device).run(frame.pixels, frame.noise_key, frame.options)
 
     def close(self) -> None:
         """Finish all frames, and accept no others."""
@@ -201,6 +213,10 @@ class Service:
             _end(self._frames, len(threads))
         for thread in threads:
             thread.join()
+        with suppress(queue.Empty):  # frames of a device that failed when no other was left
+            while True:
+                for each in self._frames.get_nowait() or ():
+                    each.set_exception(ImageError(ENDED))
 
 
 SERVICES: "weakref.WeakSet[Service]" = weakref.WeakSet()  # with threads
@@ -281,16 +297,22 @@ class _Server:
                     self._finish()
                 if taken:
                     self._start(taken)
-            except DeviceError as error:
-                taken = [each for each in taken if not each.done()]
-                unfinished = [each for group in self._started for each, _ in group]
-                unfinished += [each for each in taken if each not in unfinished]
-                self._started.clear()
-                if self._leaves(error, unfinished):
+            except BaseException as error:  # it must not end the thread, for which frames wait
+                if self._gives_up(error, taken):
                     return
-                for each in unfinished:
-                    each.set_exception(error)
             taken = []  # it holds images
+
+    def _gives_up(self, error: BaseException, taken: Sequence[Development]) -> bool:
+        """Return whether other devices take over the frames of this one; otherwise, fail them."""
+        unfinished = [each for group in self._started for each, _ in group]
+        unfinished += [each for each in taken if each not in unfinished]
+        unfinished = [each for each in unfinished if not each.done()]
+        self._started.clear()
+        if self._leaves(error, unfinished):
+            return True
+        for each in unfinished:
+            each.set_exception(error)
+        return False
 
     def _leaves(self, error: BaseException, unfinished: Sequence[Development]) -> bool:
         """Return whether other devices develop the frames of this one, which has failed."""
