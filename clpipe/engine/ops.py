@@ -98,21 +98,23 @@ def chain_ops(
 
 
 @cached_by_structure
-def _inverse_pairs(chain: Chain, frame: FrameKind) -> tuple[tuple[str, Pass, str, Pass], ...]:
-    """Return the passes that may undo the pass before, and those passes, each with its step."""
-    found: list[tuple[str, Pass, str, Pass]] = []
-    last: tuple[str, Pass] | None = None
-    for step in chain.steps:
-        passes = step.passes
-        if not passes or (
-            frame is not FrameKind.LATER and any(PREVIOUS in each.reads for each in passes)
-        ):
-            continue
-        access = passes[0].access
-        if last and isinstance(access, Pointwise) and access.inverse_of == last[1].function:
-            found.append((step.name, passes[0], *last))
-        last = step.name, passes[-1]
-    return tuple(found)
+def _inverse_pairs(chain: Chain) -> dict[bool, list[tuple[str, Pass, str, Pass]]]:
+    """Return the passes that may undo the pass before, and those passes, each with its step.
+
+    They are given by whether steps with state have passes.
+    """
+    found: dict[bool, list[tuple[str, Pass, str, Pass]]] = {False: [], True: []}
+    for with_state, pairs in found.items():
+        last: tuple[str, Pass] | None = None
+        for step in chain.steps:
+            passes = step.passes
+            if not passes or (not with_state and any(PREVIOUS in each.reads for each in passes)):
+                continue
+            access = passes[0].access
+            if last and isinstance(access, Pointwise) and access.inverse_of == last[1].function:
+                pairs.append((step.name, passes[0], *last))
+            last = step.name, passes[-1]
+    return found
 
 
 def undone(chain: Chain, frame: FrameKind) -> tuple[bool, ...]:
@@ -120,14 +122,11 @@ def undone(chain: Chain, frame: FrameKind) -> tuple[bool, ...]:
 
     This depends on numbers, so chains of one structure may differ in it, and so do their plans.
     """
-    pairs = _inverse_pairs(chain, frame)
+    pairs = _inverse_pairs(chain)[frame is FrameKind.LATER]
     if not pairs:
         return ()
     arguments = chain.arguments
-    return tuple(
-        undoes(pass_, arguments[step], previous, arguments[earlier])
-        for step, pass_, earlier, previous in pairs
-    )
+    return tuple([undoes(p, arguments[s], q, arguments[t]) for s, p, t, q in pairs])
 
 
 def border_periods(chain: Chain) -> dict[str, tuple[int, int] | None]:
@@ -146,10 +145,11 @@ def undoes(
     access = pass_.access
     if not isinstance(access, Pointwise) or access.inverse_of != previous.function:
         return False
-    return all(
-        bytes_of(arguments[mine]) == bytes_of(previous_arguments[theirs])
-        for mine, theirs in zip(pass_.arguments, previous.arguments, strict=True)
-    )
+    for mine, theirs in zip(pass_.arguments, previous.arguments, strict=True):
+        one, other = arguments[mine], previous_arguments[theirs]
+        if one is not other and bytes_of(one) != bytes_of(other):
+            return False
+    return True
 
 
 def ops_of(step: Step, arguments: Mapping[str, Argument]) -> tuple[Op, ...]:
