@@ -684,6 +684,53 @@ def test_a_thread_that_dies_ends_the_run(renders, tmp_path, monkeypatch):
         assert len(caught) == 1 and "a mistake of ours" in caught[0]
 
 
+@pytest.mark.parametrize(
+    ("name", "error", "text"),
+    [
+        ("device", RequestError, "--jobs: 2: no thread can be started for 'device'"),
+        ("encode", RuntimeError, "can't start new thread"),
+    ],
+)
+def test_threads_that_cannot_start_end_the_run(renders, tmp_path, monkeypatch, name, error, text):
+    renders(6)
+    (tmp_path / "out").mkdir()
+    worker, jobs = worker_of(tmp_path)
+    start, caught = threading.Thread.start, []
+
+    def starting(thread):
+        if thread.name.startswith(name):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    def run():
+        try:
+            list(Batch(worker, [None], 2).run(jobs))
+        except Exception as problem:
+            caught.append(problem)
+
+    monkeypatch.setattr(threading.Thread, "start", starting)
+    running = threading.Thread(target=run, daemon=True, name="run")
+    running.start()
+    running.join(GUARD)
+    assert [type(each) for each in caught] == [error] and text in str(caught[0])
+
+
+def test_a_run_that_skips_all_images_starts_no_device(device, renders, tmp_path):
+    renders(4)
+    (tmp_path / "out").mkdir()
+
+    class Unused(Device):
+        def submit(self, works):
+            raise DeviceError("it is used")
+
+    worker, jobs = worker_of(tmp_path)
+    assert [o.status for o in Batch(worker, [device]).run(jobs)] == ["done"] * 4
+    worker, jobs = worker_of(tmp_path)
+    unused = Unused(device.info)
+    unused.is_compiled = lambda _: False
+    assert [o.status for o in Batch(worker, [unused]).run(jobs)] == ["skipped"] * 4
+
+
 def test_what_a_device_leaves_another_does(device, renders, tmp_path, caplog):
     renders(8)
     (tmp_path / "out").mkdir()
@@ -704,7 +751,7 @@ def test_what_a_device_leaves_another_does(device, renders, tmp_path, caplog):
     broken.is_compiled = Other.is_compiled = lambda *_: True
     outcomes = list(Batch(worker, [broken, Other(device.info)]).run(jobs))
     assert [o.status for o in outcomes] == ["done"] * 8
-    assert "it is given up; the other devices go on" in caplog.text
+    assert "it is given up; the other devices continue" in caplog.text
     for path in (tmp_path / "out").iterdir():
         path.unlink()
     with pytest.raises(DeviceError, match="it is given up"):

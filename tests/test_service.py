@@ -4,6 +4,7 @@ import gc
 import itertools
 import multiprocessing
 import threading
+import time
 import weakref
 
 import numpy as np
@@ -105,12 +106,23 @@ class Broken(Device):
 
 
 def test_another_device_takes_over(device, caplog):
-    service = Service([Broken(device.info), device])
-    ordered = frames()
-    for _ in range(2):
-        for development, frame in zip(service.develop(ordered), ordered, strict=True):
-            same(development.result(GUARD), alone(frame, device))
-    assert caplog.text.count("it is given up; the other devices go on") <= 1
+    is_broken = threading.Event()
+
+    class First(Broken):
+        def submit(self, works):
+            is_broken.set()
+            return super().submit(works)
+
+    class Second(Device):
+        def submit(self, works):
+            assert is_broken.wait(GUARD)
+            return super().submit(works)
+
+    service, ordered = Service([First(device.info), Second(device.info)]), frames()
+    for frame in ordered * 2:
+        (development,) = service.develop([frame])
+        same(development.result(GUARD), alone(frame, device))
+    assert caplog.text.count("it is given up; the other devices continue") == 1
 
 
 def test_the_last_device_fails_its_frames_and_tries_the_next(device):
@@ -249,3 +261,29 @@ def test_a_thread_that_cannot_start_ends_the_others(device, monkeypatch):
         with pytest.raises(RuntimeError, match="can't start"):
             service.develop([frame])
     service.develop([frame])[0].result(GUARD)
+
+
+def test_numpy_develops_one_frame_at_a_time():
+    """A frame takes much memory in NumPy."""
+    lock, most, inside = threading.Lock(), [], []
+
+    class Watched(Frame):
+        def runner(self, device):
+            return self
+
+        def run(self, *_):
+            with lock:
+                inside.append(self)
+                most.append(len(inside))
+            time.sleep(0.01)
+            with lock:
+                inside.remove(self)
+
+    (frame, *_), service = frames(), Service([None])
+    watched = Watched(frame.chain, frame.pixels, "k")
+    threads = [threading.Thread(target=service.run, args=(watched,)) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(GUARD)
+    assert most == [1] * 6

@@ -150,15 +150,17 @@ class Developing:
         if not result:
             files.set_result(None)
             return
-        arguments = state, recipe, result, development.device, files
         try:
-            self._encoders.submit(self._encode, *arguments)
-        except RuntimeError:  # the system allows no more threads
-            self._encode(*arguments)
+            self._encoders.submit(self._encode, state, recipe, result, development.device, files)
+        except RuntimeError as problem:  # the system allows no more threads
+            self._fail(problem)
+            files.set_exception(problem)
 
     def _encode(
         self, state: JobState, recipe: Recipe, result: Result, device: Device | None, files: Files
     ) -> None:
+        if files.done():  # the run has failed, but the pool has kept the call
+            return
         written = None
         try:
             with CpuTimer("Python"):

@@ -297,7 +297,7 @@ class _Server:
                     self._finish()
                 if taken:
                     self._start(taken)
-            except BaseException as error:  # it must not end the thread, for which frames wait
+            except BaseException as error:  # callers wait for the frames of this thread
                 if self._gives_up(error, taken):
                     return
             taken = []  # it holds images
@@ -318,7 +318,7 @@ class _Server:
         """Return whether other devices develop the frames of this one, which has failed."""
         if not isinstance(error, DeviceError) or not self._spare.acquire(blocking=False):
             return False
-        log.warning("%s; the other devices go on", error)
+        log.warning("%s; the other devices continue", error)
         for each in unfinished:
             self._frames.put([each])
         return True
