@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from clpipe.analysis.sharpness import edges_in, median_edge, sharpest, slanted_edge
+from clpipe.analysis.quality.charts import slanted_edge
+from clpipe.analysis.sharpness import edges_in, median_edge, sharpest
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.chain.truth import picture_without_noise
@@ -14,29 +15,33 @@ ANGLES = (5, 20, 70, 85)
 CONTRASTS = (10, 4, 1.5)
 
 
-def developed(chain, device, contrast, frames=1):
+def developed(chain, device, contrast, frames=1, angles=ANGLES):
     """Return the median of developed slanted edges, from the means of frames."""
     runner, edges = Runner(chain, device), []
-    for angle in ANGLES:
+    for angle in angles:
         render = slanted_edge(contrast, angle)
         pictures = [runner.run(render, f"{angle}:{n}").encoded for n in range(frames)]
         edges += edges_in(np.mean(pictures, axis=0).round().astype(np.uint8))
-    assert len(edges) > 20
+    assert len(edges) > 5 * len(angles)
     return median_edge(edges)
 
 
 @pytest.mark.parametrize("sigma", [0.4, 0.65, 1.0])
 def test_the_mtf_is_that_of_the_blur(sigma, device):
     stages = {"stages": ["optical_blur", "gamma"], "optical_blur": {"sigma": sigma}}
-    edge = developed(make_chain(settings_from(stages)), device, 4)
     light, frequency = line_spread(sigma, 0, 0), np.linspace(0, 0.5, 501)
     places = np.arange(len(light)) - len(light) // 2
-    # The render's edge was sampled by the area of pixels.
-    mtf = np.cos(2 * np.pi * frequency[:, None] * places) @ light * np.sinc(frequency)
-    assert edge.mtf50 == pytest.approx(frequency[np.argmax(mtf < 0.5)], rel=0.03)
-    assert edge.nyquist == pytest.approx(mtf[-1], abs=0.03)
-    assert max(edge.overshoot, edge.undershoot) < 0.01
-    assert max(edge.red, edge.blue) < 0.02
+    for angle in ANGLES:
+        edge = developed(make_chain(settings_from(stages)), device, 4, angles=[angle])
+        # The render's edge was sampled by the area of pixels.
+        mtf = 1.0
+        for part in (np.cos(np.radians(angle)), np.sin(np.radians(angle))):
+            blurred = np.cos(2 * np.pi * frequency[:, None] * part * places) @ light
+            mtf = mtf * blurred * np.sinc(frequency * part)
+        assert edge.mtf50 == pytest.approx(frequency[np.argmax(mtf < 0.5)], rel=0.015)
+        assert edge.nyquist == pytest.approx(mtf[-1], abs=0.02)
+        assert max(edge.overshoot, edge.undershoot) < 0.01
+        assert max(edge.red, edge.blue) < 0.02
 
 
 def test_edges_at_the_base_iso_are_those_of_cameras(device):
@@ -60,7 +65,7 @@ def test_edges_do_not_become_sharper_with_noise(contrast, denoise, device):
         if contrast > 2 and denoise == "biweight":
             for truth in ("clean", "development"):
                 edge = developed(picture_without_noise(truth, chain), device, contrast)
-                assert edge.mtf50 == pytest.approx(noisy.mtf50, rel=0.06)
+                assert edge.mtf50 == pytest.approx(noisy.mtf50, rel=0.08)  # angles differ by 6 %
 
 
 def test_lateral_colour_is_measured(device):

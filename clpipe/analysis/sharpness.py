@@ -1,77 +1,70 @@
-"""Sharpness of pictures, from their straight edges, like the e-SFR of ISO 12233:2017.
+"""Sharpness of pictures, from their straight edges: the e-SFR of ISO 12233:2024.
 
 An edge that is slanted against the pixel grid crosses each of its rows at another fraction of a
 pixel. All pixels around it together sample its profile finely. The Fourier transform of the
-profile's slope is the modulation transfer function (MTF).
+profile's slope is the modulation transfer function (MTF). Frequencies are those across the edge.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from clpipe.base.types import Array, Doubles, Floats
+from clpipe.analysis.intensity import NOT_IN_JSON
+from clpipe.base.types import Array, Doubles
 from clpipe.reference.transfer import inverse_srgb_curve
 
 SIDE = 28  # px, of the windows in which edges are sought
 STEP = 7  # px between windows
-REACH = 9  # px of the profile to each side of an edge
+REACH = 9  # px of the profile to each side of an edge that is sought
+WIDE = 20  # px, of an edge that fills its picture
 FLAT = 3  # px at each end of the profile that belong to the plateaus
 BINS = 4  # of the profile in a pixel
 MIN_CONTRAST = 0.03  # between the plateaus, in linear light
 MAX_BEND = 0.35  # px; rms distance of an edge's points from its line
 MAX_UNEVENNESS = 0.15  # rms of a plateau over the contrast
 MIN_EDGES = 12
+SMOOTHINGS = 3  # with a binomial of three values, before the line of an edge is fitted
+RINGS = 16  # of frequencies, of noise
+ROUNDING = 1 / 255**2 / 12  # the least power of noise, in a file of eight bits
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # weights of BT.709, for linear light
+FREQUENCIES = np.arange(257) / 256  # cycles/px, at which MTFs are computed
+CURVES = ("luma", "red", "green", "blue")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Edge:
     """A straight edge of a picture.
 
     Args:
         mtf50: the frequency at which contrast falls to a half, cycles/px.
+        mtf10: the frequency at which it falls to a tenth; NaN above 1 cycle/px.
         nyquist: the MTF at 0.5 cycles/px.
         overshoot: how far the bright side exceeds its plateau near the edge, over the contrast.
         undershoot: the same of the dark side.
         red: the place of the edge in red minus that in green, px, towards the bright side.
         blue: the same of blue.
+        contrast: the difference of luminance between the sides.
+        capacity: Koren's information capacity of this contrast, bits/px.
+        mtf: the MTF of each of :data:`CURVES` at :data:`FREQUENCIES`, (4, 257).
     """
 
     mtf50: float
+    mtf10: float
     nyquist: float
     overshoot: float
     undershoot: float
     red: float
     blue: float
-
-
-def slanted_edge(contrast: float, angle: float, size: int = 120, middle: float = 0.18) -> Floats:
-    """Return a render of a grey slanted edge, (size, size, 3), in linear light.
-
-    >>> edge = slanted_edge(4, 0, size=8)
-    >>> edge[0, [0, -1], 0].astype(float).round(2).tolist()
-    [0.09, 0.36]
-
-    Args:
-        contrast: of the bright side to the dark side.
-        angle: of the edge's normal against rows, degrees.
-        size: side, px.
-        middle: the geometric mean of both sides.
-    """
-    samples = 8
-    at = (np.arange(size * samples) + 0.5) / samples - size / 2
-    normal = np.radians(angle)
-    distance = at * np.cos(normal) + at[:, None] * np.sin(normal)
-    share = (distance > 0).reshape(size, samples, size, samples).mean((1, 3))
-    dark, bright = middle / np.sqrt(contrast), middle * np.sqrt(contrast)
-    light = np.asarray(dark + (bright - dark) * share, np.float32)
-    return light[..., None].repeat(3, 2)
+    contrast: float
+    capacity: float
+    mtf: Doubles = field(metadata=NOT_IN_JSON)
 
 
 def edges_in(picture: Array) -> list[Edge]:
     """Return the straight, isolated edges of a picture.
 
+    >>> from clpipe.analysis.quality.charts import slanted_edge
     >>> [edge] = edges_in(np.uint8(slanted_edge(4, 5, size=SIDE) * 255))
     >>> 0.3 < edge.mtf50 < 0.7
     True
@@ -81,16 +74,42 @@ def edges_in(picture: Array) -> list[Edge]:
     """
     light = inverse_srgb_curve(picture / 255)
     luma = light @ LUMINANCE
-    down, across = np.gradient(luma)
+    slopes = np.stack(np.gradient(luma))
     height, width = luma.shape
-    found: list[Edge] = []
+    found = []
     for y in range(0, height - SIDE + 1, STEP):
         for x in range(0, width - SIDE + 1, STEP):
             window = np.s_[y : y + SIDE, x : x + SIDE]
             levels = picture[window]
             if np.ptp(luma[window]) >= MIN_CONTRAST and levels.max() < 253 and levels.min() > 1:
-                found += _edge_of(light[window], luma[window], across[window], down[window])
+                distance = _distance(slopes[:, *window])
+                edge = None if distance is None else _edge(light[window], distance, REACH, True)
+                found += [edge] if edge else []
     return found
+
+
+def edge_of(light: Doubles) -> Edge | None:
+    """Return the edge that fills a picture, or None if it has no straight edge.
+
+    The edge may be curved by distortion, like a polynomial of the third degree.
+
+    >>> from clpipe.analysis.quality.charts import slanted_edge
+    >>> edge = edge_of(slanted_edge(4, 5).astype(float))
+    >>> round(edge.mtf50 / 0.603, 2), round(edge.contrast, 2)  # a square pixel, along its side
+    (1.0, 0.27)
+
+    Args:
+        light: linear RGB, (height, width, 3). It should have 40 px to both sides of the edge.
+    """
+    smooth = light @ LUMINANCE
+    for _ in range(2 * SMOOTHINGS):  # along each axis, against noise
+        wide = np.pad(smooth, ((1, 1), (0, 0)), "edge")
+        smooth = ((wide[:-2] + 2 * wide[1:-1] + wide[2:]) / 4).T
+    distance = _distance(np.stack(np.gradient(smooth)), fills=True)
+    if distance is None:
+        return None
+    reach = int(min(WIDE, *np.abs(np.percentile(distance, [3, 97]))))
+    return _edge(light, distance, reach, False) if reach > 2 * FLAT else None
 
 
 def sharpest(edges: Sequence[Edge]) -> Edge | None:
@@ -106,111 +125,167 @@ def sharpest(edges: Sequence[Edge]) -> Edge | None:
 
 def median_edge(edges: Sequence[Edge]) -> Edge:
     """Return the medians of the edges' figures; of displacements, those of their sizes."""
-    return Edge(*np.median(np.abs([astuple(edge) for edge in edges]), axis=0).tolist())
+    values = {each.name: [getattr(edge, each.name) for edge in edges] for each in fields(Edge)}
+    medians = {name: np.median(np.abs(each), axis=0) for name, each in values.items()}
+    mtf = medians.pop("mtf")
+    return Edge(**{name: float(each) for name, each in medians.items()}, mtf=mtf)
 
 
-def _edge_of(light: Doubles, luma: Doubles, across: Doubles, down: Doubles) -> Iterator[Edge]:
-    """Yield the edge through the middle of a window, if there is one."""
-    distance = _distance(across, down)
-    profile = None if distance is None else _profile(distance, luma)
-    if distance is None or profile is None:
-        return
-    dark, bright = profile[: FLAT * BINS], profile[-FLAT * BINS :]
-    contrast = bright.mean() - dark.mean()
-    uneven = max(dark.std(), bright.std()) > MAX_UNEVENNESS * contrast
-    places = [_centre(_profile(distance, light[..., c])) for c in range(3)]
-    if contrast < MIN_CONTRAST or uneven or None in places:
-        return
-    profile = (profile - dark.mean()) / contrast
-    frequency, mtf = _transfer(profile)
-    below = int(np.argmax(mtf < 0.5))
-    if below == 0:
-        return
-    near = profile[FLAT * BINS : -FLAT * BINS].reshape(-1, BINS // 2).mean(1)
-    red, green, blue = (float(each or 0) for each in places)
-    yield Edge(
-        float(np.interp(0.5, mtf[[below, below - 1]], frequency[[below, below - 1]])),
-        float(np.interp(0.5, frequency, mtf)),
+def frequency_at(level: float, mtf: Doubles) -> float:
+    """Return the lowest frequency at which an MTF falls to a level, cycles/px; NaN without one.
+
+    >>> round(frequency_at(0.5, np.sinc(FREQUENCIES)), 3)
+    0.603
+    """
+    below = int(np.argmax(mtf < level))
+    if not below:
+        return float("nan")
+    return float(np.interp(level, mtf[[below, below - 1]], FREQUENCIES[[below, below - 1]]))
+
+
+def _edge(light: Doubles, distance: Doubles, reach: int, strict: bool) -> Edge | None:
+    """Return the edge of a window, from the distance of its pixels; None if it is not isolated."""
+    luma = light @ LUMINANCE
+    planes = (luma, *np.moveaxis(light, -1, 0))
+    profiles = [p for each in planes if (p := _profile(distance, each, reach)) is not None]
+    if len(profiles) < len(planes):
+        return None
+    ends = np.s_[: FLAT * BINS], np.s_[-FLAT * BINS :]
+    spans = [[p[end] for end in ends] for p in profiles]
+    contrasts = [bright.mean() - dark.mean() for dark, bright in spans]
+    contrast, uneven = contrasts[0], max(each.std() for each in spans[0])
+    if min(contrasts[1:]) < MIN_CONTRAST / 2 or contrast < MIN_CONTRAST:
+        return None
+    if strict and uneven > MAX_UNEVENNESS * contrast:
+        return None
+    scaled = [
+        (p - dark.mean()) / size
+        for p, (dark, _), size in zip(profiles, spans, contrasts, strict=True)
+    ]
+    mtf = np.stack([_transfer(profile) for profile in scaled])
+    mtf50 = frequency_at(0.5, mtf[0])
+    if np.isnan(mtf50):
+        return None
+    near = scaled[0][FLAT * BINS : -FLAT * BINS].reshape(-1, BINS // 2).mean(1)
+    red, green, blue = (_centre(profile, reach) for profile in scaled[1:])
+    plateaus = (abs(distance) > reach - FLAT) & (abs(distance) < reach + 2 * FLAT)
+    smooth = np.interp(distance, (np.arange(2 * reach * BINS) + 0.5) / BINS - reach, profiles[0])
+    noise = np.where(plateaus, luma - smooth, 0.0)
+    return Edge(
+        mtf50,
+        frequency_at(0.1, mtf[0]),
+        float(mtf[0, len(FREQUENCIES) // 2]),
         max(float(near.max()) - 1, 0.0),
         max(float(-near.min()), 0.0),
         red - green,
         blue - green,
+        float(contrast),
+        _capacity(contrast, mtf[0], noise, int(plateaus.sum())),
+        mtf,
     )
 
 
-def _distance(across: Doubles, down: Doubles) -> Doubles | None:
+def _capacity(contrast: float, mtf: Doubles, noise: Doubles, count: int) -> float:
+    """Return the information capacity, bits/px (Koren, "Image information metrics", EI 2023).
+
+    It is the integral of log2(1 + S/N) over all frequencies below 0.5 cycles/px. The signal is
+    spread evenly over the contrast, so its power is that of the contrast times the MTF over 12.
+
+    Args:
+        contrast: between the plateaus.
+        mtf: at :data:`FREQUENCIES`.
+        noise: luminance minus the edge in plateaus, (height, width), and 0 elsewhere.
+        count: the number of pixels in plateaus.
+    """
+    height, width = noise.shape
+    power = np.abs(np.fft.fft2(noise)) ** 2 / count
+    frequency = np.hypot(np.fft.fftfreq(width), np.fft.fftfreq(height)[:, None])
+    rings = (frequency * RINGS / 0.5).astype(int).ravel()
+    radial = np.bincount(rings, power.ravel())[:RINGS] / np.bincount(rings)[:RINGS]
+    at = (np.arange(RINGS) + 0.5) * 0.5 / RINGS
+    signal = (contrast * np.interp(at, FREQUENCIES, mtf)) ** 2 / 12
+    bits = np.log2(1 + signal / np.maximum(radial, ROUNDING))
+    return float(2 * np.pi * (bits * at).sum() * 0.5 / RINGS)
+
+
+def _distance(slopes: Doubles, fills: bool = False) -> Doubles | None:
     """Return each pixel's distance from a window's edge, px, or None if there is no straight edge.
 
     It is above 0 on the bright side.
 
     Args:
-        across: the slope along rows, (SIDE, SIDE).
-        down: the slope along columns, of that shape.
+        slopes: the slopes down and across, (2, height, width).
+        fills: whether an edge is known to fill the window. It may then be curved, noisy, and off
+            the centre.
     """
+    down, across = slopes
     steep = np.hypot(across, down)
     weights = np.where(steep > 0.3 * steep.max(), steep, 0) ** 2
     xx, yy, xy = ((weights * p).sum() for p in (across**2, down**2, across * down))
-    if np.hypot(xx - yy, 2 * xy) < 0.9 * (xx + yy):
+    if np.hypot(xx - yy, 2 * xy) < (0.5 if fills else 0.9) * (xx + yy):
         return None
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the normal: the structure tensor's main axis
-    at = np.arange(SIDE) - (SIDE - 1) / 2
     if (weights * (across * np.cos(angle) + down * np.sin(angle))).sum() < 0:
         angle += np.pi
-    distance = at * np.cos(angle) + at[:, None] * np.sin(angle)
-    place = at[:, None] * np.cos(angle) - at * np.sin(angle)
-    line = _line(place, distance, weights)
-    if line is None:
+    y, x = (np.arange(size) - (size - 1) / 2 for size in down.shape)
+    distance = x * np.cos(angle) + y[:, None] * np.sin(angle)
+    place = y[:, None] * np.cos(angle) - x * np.sin(angle)
+    line, bend = _line(place, distance, weights, 1)
+    if fills:
+        rising = np.maximum(across * np.cos(angle) + down * np.sin(angle), 0)
+        for _ in range(2):
+            near = np.clip(1 - abs(distance - line(place)) / REACH, 0, 1)
+            line, bend = _line(place, distance, rising * near, 3)
+    elif bend > MAX_BEND or abs(line(0)) > STEP:
         return None
-    offset, slope = line
-    distance = (distance - offset - slope * place) / np.hypot(1, slope)
+    distance = (distance - line(place)) / np.hypot(1, line.deriv()(place))
     length = abs(place[abs(distance) < 1]).max(initial=0)
-    return distance if abs(offset) <= STEP and length >= SIDE / 4 else None
+    return distance if length >= min(down.shape) / 4 else None
 
 
-def _line(place: Doubles, distance: Doubles, weights: Doubles) -> tuple[float, float] | None:
-    """Return offset and slope of the edge's points, or None if they are not on a line."""
-    rows = np.clip((place + SIDE / 2).astype(int), 0, SIDE - 1)
-    total = np.bincount(rows.ravel(), weights.ravel(), SIDE)
+def _line(
+    place: Doubles, distance: Doubles, weights: Doubles, degree: int
+) -> tuple[np.poly1d, float]:
+    """Return the polynomial of an edge's points, and their rms distance from it, px."""
+    rows = np.floor(place - place.min()).astype(int)
+    total = np.bincount(rows.ravel(), weights.ravel())
     used = total > 0.2 * total.max()
-    if used.sum() < SIDE / 2:
+    if used.sum() <= max(degree, min(place.shape) / 2):
+        return np.poly1d([0]), np.inf
+    points = np.bincount(rows.ravel(), (weights * distance).ravel())[used] / total[used]
+    at = (np.arange(len(total)) + 0.5 + place.min())[used]
+    line = np.poly1d(np.polyfit(at, points, degree))
+    return line, float(np.sqrt(np.mean((points - line(at)) ** 2)))
+
+
+def _profile(distance: Doubles, values: Doubles, reach: int) -> Doubles | None:
+    """Return the values in bins of the distance, from -reach to reach, or None if many are empty.
+
+    Samples are not even in a bin, so each mean is moved along its slope to the bin's centre.
+    """
+    bins = np.floor((distance + reach) * BINS).astype(int)
+    size = 2 * reach * BINS
+    inside = (bins >= 0) & (bins < size)
+    counts = np.bincount(bins[inside], minlength=size)
+    filled = np.flatnonzero(counts)
+    if len(filled) < 0.9 * size:
         return None
-    points = np.bincount(rows.ravel(), (weights * distance).ravel(), SIDE)[used] / total[used]
-    at = (np.arange(SIDE) + 0.5 - SIDE / 2)[used]
-    slope, offset = np.polyfit(at, points, 1)
-    bend = np.sqrt(np.mean((points - offset - slope * at) ** 2))
-    return (float(offset), float(slope)) if bend <= MAX_BEND else None
+    sums = (np.bincount(bins[inside], each[inside], size)[filled] for each in (distance, values))
+    at, mean = (each / counts[filled] for each in sums)
+    moved = mean + np.gradient(mean, at) * ((filled + 0.5) / BINS - reach - at)
+    return np.interp(np.arange(size), filled, moved)
 
 
-def _profile(distance: Doubles, values: Doubles) -> Doubles | None:
-    """Return the means in bins of the distance, from -REACH to REACH, or None if one is empty."""
-    bins = np.floor((distance + REACH) * BINS).astype(int)
-    inside = (bins >= 0) & (bins < 2 * REACH * BINS)
-    counts = np.bincount(bins[inside], minlength=2 * REACH * BINS)
-    if not counts.all():
-        filled = np.flatnonzero(counts)
-        if len(filled) < 0.9 * len(counts):
-            return None
-        sums = np.bincount(bins[inside], values[inside], minlength=len(counts))
-        return np.interp(np.arange(len(counts)), filled, sums[filled] / counts[filled])
-    return np.asarray(np.bincount(bins[inside], values[inside], len(counts)) / counts)
-
-
-def _transfer(profile: Doubles) -> tuple[Doubles, Doubles]:
-    """Return frequencies, cycles/px, and the MTF of a profile."""
+def _transfer(profile: Doubles) -> Doubles:
+    """Return the MTF of a profile at :data:`FREQUENCIES`."""
     spread = np.diff(profile)
     spread = spread * np.hanning(len(spread) + 2)[1:-1] ** 0.5
-    mtf = np.abs(np.fft.rfft(spread, 1024))
-    frequency = np.fft.rfftfreq(1024, 1 / BINS)
-    used = frequency < 1
+    mtf = np.abs(np.fft.rfft(spread, 256 * BINS))[: len(FREQUENCIES)]
     # Bins and differences have a width of their own.
-    width = np.sinc(frequency[used] / BINS) ** 2
-    found = np.asarray(mtf[used] / mtf[0] / width, np.float64)
-    return np.asarray(frequency[used], np.float64), found
+    return np.asarray(mtf / mtf[0] / np.sinc(FREQUENCIES / BINS) ** 2)
 
 
-def _centre(profile: Doubles | None) -> float | None:
+def _centre(profile: Doubles, reach: int) -> float:
     """Return the centre of an edge's slope, px."""
-    if profile is None or abs(profile[-1] - profile[0]) < MIN_CONTRAST / 2:
-        return None
-    spread = np.diff(profile)[(REACH - 4) * BINS : -(REACH - 4) * BINS]
-    return float((spread * np.arange(len(spread))).sum() / spread.sum() / BINS)
+    middle = np.diff(profile)[(reach - 4) * BINS : -(reach - 4) * BINS]
+    return float((middle * np.arange(len(middle))).sum() / middle.sum() / BINS)

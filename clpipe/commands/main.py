@@ -26,7 +26,15 @@ from clpipe.commands.notices import NOTICES
 # name.
 GROUPS = {
     "Make pictures": ("run", "replay", "dataset", "stream"),
-    "View and measure results": ("status", "report", "explore", "compare", "measure", "poses"),
+    "View and measure results": (
+        "status",
+        "report",
+        "explore",
+        "compare",
+        "measure",
+        "quality",
+        "poses",
+    ),
     "Cameras": ("cameras", "calibrate", "emva", "match"),
     "Stages and devices": ("stages", "plan", "devices", "check", "bench"),
 }

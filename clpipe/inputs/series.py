@@ -45,7 +45,7 @@ class Series:
         Raises:
             RequestError: two cameras have the same name.
         """
-        return [output / folder for folder, _ in self._members()]
+        return [output / folder for folder, _ in self.members()]
 
     def jobs(self, jobs: Sequence[Job], settings: Settings) -> list[Job]:
         """Return each job once for each combination of camera and ISO.
@@ -58,7 +58,7 @@ class Series:
             RequestError: a camera does not exist, is listed twice or lacks an ISO, or a row of a
                 manifest sets the camera or ISO as well.
         """
-        members = list(self._members())
+        members = list(self.members())
         if members == [("", {})]:
             return list(jobs)
         for _, values in members:
@@ -81,7 +81,7 @@ class Series:
             for folder, values in members
         ]
 
-    def _members(self) -> Iterator[tuple[str, dict[str, Any]]]:
+    def members(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the folders, each with the settings of its pictures."""
         cameras: list[tuple[str, dict[str, Any]]] = [("", {})]
         threshold = 0 if self.always else 1

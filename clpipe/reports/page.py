@@ -69,14 +69,6 @@ def html(runs: Sequence[Run], report_progress: Callable[[str], None] = lambda _:
         runs: one or two runs.
         report_progress: called with a description of the next step.
     """
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        finalize=escaped,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     first, *others = runs
     labels = labels_of(runs)
     sessions_by_run = [figures.sessions(run.logs) for run in runs]
@@ -118,34 +110,52 @@ def html(runs: Sequence[Run], report_progress: Callable[[str], None] = lambda _:
     totals = [figures.totals(run, found) for run, found in zip(runs, sessions_by_run, strict=True)]
     names = list(dict.fromkeys(name for rows in totals for name, _ in rows))
     found = [session for each in sessions_by_run for session in each]
-    return environment.get_template("report.html").render(
-        title=" and ".join(dict.fromkeys(run.folder.resolve().name for run in runs)),
-        version=__version__,
-        labels=labels,
-        totals=[(name, [dict(rows).get(name, "-") for rows in totals]) for name in names],
-        sessions=[session_row(session) for session in found[-SESSIONS:]],
-        failures=listed([text for each in sessions_by_run for text in figures.last_failures(each)]),
-        warnings=listed([text for run in runs for text in warnings(run)]),
-        problems=listed(list(dict.fromkeys(problems))),
-        pace=pace_drawings(found),
-        facts=machine_facts([picture for run in runs for picture in run.pictures]),
-        steps=steps[0],
-        differences=differences(*steps) if others else [],
-        drawn=drawings_of(drawn),
-        pictures=sum(sheet.pictures for sheet in sheets),
-        shown_pictures=len(entries),
-        entries=script_json(entries),
-        large=shown,
-        views=script_json([view_record(each) for each in shown]),
-        noise=noise,
-        real_left=REAL_LEFT,
-        real_right=REAL_RIGHT,
-        real_edges=REAL_EDGES,
-        laws=all_laws,
-        law_drawings=law_drawings,
-        limit=f"{LIMIT:g}",
-        style=page_text("css"),
-        script=page_text("js"),
+    return (
+        page_environment()
+        .get_template("report.html")
+        .render(
+            title=" and ".join(dict.fromkeys(run.folder.resolve().name for run in runs)),
+            version=__version__,
+            labels=labels,
+            totals=[(name, [dict(rows).get(name, "-") for rows in totals]) for name in names],
+            sessions=[session_row(session) for session in found[-SESSIONS:]],
+            failures=listed(
+                [text for each in sessions_by_run for text in figures.last_failures(each)]
+            ),
+            warnings=listed([text for run in runs for text in warnings(run)]),
+            problems=listed(list(dict.fromkeys(problems))),
+            pace=pace_drawings(found),
+            facts=machine_facts([picture for run in runs for picture in run.pictures]),
+            steps=steps[0],
+            differences=differences(*steps) if others else [],
+            drawn=drawings_of(drawn),
+            pictures=sum(sheet.pictures for sheet in sheets),
+            shown_pictures=len(entries),
+            entries=script_json(entries),
+            large=shown,
+            views=script_json([view_record(each) for each in shown]),
+            noise=noise,
+            real_left=REAL_LEFT,
+            real_right=REAL_RIGHT,
+            real_edges=REAL_EDGES,
+            laws=all_laws,
+            law_drawings=law_drawings,
+            limit=f"{LIMIT:g}",
+            style=page_text("css"),
+            script=page_text("js"),
+        )
+    )
+
+
+def page_environment() -> Environment:
+    """Return the environment of the templates of pages."""
+    return Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        finalize=escaped,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
 
 

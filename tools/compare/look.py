@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from clpipe.analysis.sharpness import Edge, edges_in, median_edge, sharpest, slanted_edge
+from clpipe.analysis.quality.charts import slanted_edge
+from clpipe.analysis.sharpness import Edge, edges_in, median_edge, sharpest
 from clpipe.base.types import Array, Doubles, Floats
 from clpipe.chain.files import load_configs
 from clpipe.chain.making import make_chain

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from clpipe.analysis.matching.scenes import Scene
-from clpipe.analysis.sharpness import Edge, edges_in, median_edge, sharpest, slanted_edge
+from clpipe.analysis.quality.charts import slanted_edge
+from clpipe.analysis.sharpness import Edge, edges_in, median_edge, sharpest
 from clpipe.base.types import Array
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay

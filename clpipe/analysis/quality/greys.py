@@ -1,0 +1,120 @@
+"""Tone and noise of grey patches: OECF, SNR, dynamic range, contrast detection probability."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from clpipe.analysis.quality.visual_noise import visual_noise
+from clpipe.base.types import Doubles
+
+LUMINANCE = np.array([0.2125, 0.7154, 0.0721])  # weights of ISO 15739, for display values
+CHROMA = 0.279, 0.088  # weights of the variances of R-Y and B-Y in its noise
+CONTRAST, TOLERANCE = 2.0, 0.5  # of the patches whose contrast is to be detected
+
+
+@dataclass(frozen=True, eq=False)
+class GreyPatches:
+    """Pictures of grey patches, from dark to bright.
+
+    Args:
+        light: the luminance of each patch, 0.18 is a middle grey.
+        levels: display values, (patch, frame, height, width, 3), 0 to 255.
+    """
+
+    light: Doubles
+    levels: Doubles
+
+    @cached_property
+    def means(self) -> Doubles:
+        """The mean level of each patch and channel, (patch, 3): the OECF of ISO 14524."""
+        return self.levels.mean((1, 2, 3))
+
+    @property
+    def luma(self) -> Doubles:
+        """The mean level of each patch."""
+        return self.means @ LUMINANCE
+
+    @cached_property
+    def sigma(self) -> Doubles:
+        """The noise of each patch in levels (ISO 15739:2023, 6.2)."""
+        y = self.levels @ LUMINANCE
+        parts = y, self.levels[..., 0] - y, self.levels[..., 2] - y
+        variances = [part.var((-2, -1)).mean(1) for part in parts]
+        return np.sqrt(variances[0] + CHROMA[0] * variances[1] + CHROMA[1] * variances[2])
+
+    @property
+    def snr(self) -> Doubles:
+        """The signal-to-noise ratio of each patch, dB; NaN where the curve is flat.
+
+        It is 20 log10 of luminance times the curve's slope over the noise.
+        """
+        signal = self.light * np.gradient(self.luma, self.light)
+        useful = (signal > 0) & (self.sigma > 1e-6) & ~(self.light >= self.saturation)
+        ratio = np.where(useful, signal, np.nan) / np.where(useful, self.sigma, np.nan)
+        return 20 * np.log10(ratio)
+
+    @property
+    def gamma(self) -> Doubles:
+        """The slope of each patch in the logarithms of level and luminance."""
+        return np.gradient(np.log(np.maximum(self.luma, 0.5)), np.log(self.light))
+
+    def visual_noise(self) -> Doubles:
+        """Return the visual noise of each patch, see :mod:`.visual_noise`."""
+        return np.array([visual_noise(each) for each in self.levels])
+
+    def light_at(self, levels: Doubles) -> Doubles:
+        """Return the light of levels, by the patches' mean levels of the same channel.
+
+        Args:
+            levels: (..., 3), 0 to 255.
+        """
+        rising = [
+            np.maximum.accumulate(self.means[:, c]) + 1e-9 * np.arange(len(self.light))
+            for c in range(3)
+        ]
+        planes = [np.interp(levels[..., c], rising[c], self.light) for c in range(3)]
+        return np.stack(planes, axis=-1)
+
+    @property
+    def saturation(self) -> float:
+        """The lowest luminance with the highest level, to half a level; NaN if no patch clips."""
+        if self.luma[-1] - self.luma[-2] > 1:
+            return float("nan")
+        return float(np.interp(self.luma[-1] - 0.5, self.luma, self.light))
+
+    @property
+    def dynamic_range(self) -> float:
+        """Stops from the luminance at which the SNR is 1 to saturation (ISO 15739:2023, 6.4).
+
+        NaN if no patch clips, or if the SNR of none is below 1.
+        """
+        snr, used = self.snr, self.light <= self.saturation
+        dark = np.flatnonzero(used & ~(snr >= 0))
+        if not len(dark) or dark[-1] + 1 >= used.sum():
+            return float("nan")
+        first = dark[-1] + 1
+        low = snr[first - 1]
+        start = np.log2(self.light[first])
+        if np.isfinite(low):
+            start = np.interp(0.0, snr[[first - 1, first]], np.log2(self.light[[first - 1, first]]))
+        return float(np.log2(self.saturation) - start)
+
+    def detection(self, step: int) -> tuple[Doubles, Doubles]:
+        """Return luminances, and the contrast detection probability there (Geese et al., EI 2018).
+
+        It is the share of pairs of pixels, one of each of two patches, whose Michelson contrast in
+        luminance is within 50 % of that of the patches.
+
+        Args:
+            step: the number of patches between both.
+        """
+        seen = self.light_at(self.levels) @ LUMINANCE
+        pairs = []
+        rng = np.random.default_rng(0)
+        for dark, bright in zip(range(len(seen) - step), range(step, len(seen)), strict=True):
+            one, two = seen[dark].ravel(), rng.permutation(seen[bright].ravel())
+            true = (self.light[bright] - self.light[dark]) / (self.light[bright] + self.light[dark])
+            contrast = (two - one) / np.maximum(two + one, 1e-12)
+            pairs.append((np.abs(contrast / true - 1) <= TOLERANCE).mean())
+        return np.sqrt(self.light[:-step] * self.light[step:]), np.array(pairs)

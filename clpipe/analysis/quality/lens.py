@@ -1,0 +1,135 @@
+"""Figures of lenses: distortion and lateral colour of dots, shading of a flat field, and glare."""
+
+import numpy as np
+
+from clpipe.analysis.quality.grids import numbered
+from clpipe.base.types import Doubles
+from clpipe.reference.image import in_blocks
+
+DARK = 0.6  # of the local white, below which a pixel belongs to a dot
+MIN_DOTS = 25
+BLOCKS = 16  # of a flat field along its longer side
+
+
+def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
+    """Return the dots of a picture, or None if there is no grid of dots.
+
+    They are the row and column of each dot from the central one, (dot, 2), and the centres of its
+    red, green and blue, (dot, 3, 2): y and x in px from the centre of the picture.
+
+    Args:
+        light: linear RGB, (height, width, 3), of dark dots on white.
+    """
+    from scipy import ndimage
+
+    green = light[..., 1]
+    white = ndimage.percentile_filter(green[::4, ::4], 90, 25).repeat(4, 0).repeat(4, 1)
+    labels, _ = ndimage.label(green < DARK * white[: green.shape[0], : green.shape[1]])
+    boxes = ndimage.find_objects(labels)
+    if len(boxes) < MIN_DOTS:
+        return None
+    starts, stops = (
+        np.array([[getattr(s, end) for s in b] for b in boxes]) for end in ("start", "stop")
+    )
+    sizes = stops - starts
+    usual = np.median(sizes, axis=0)
+    margin = int(usual.max() / 2) + 2
+    whole = np.abs(sizes - usual) <= 0.35 * usual + 1
+    inside = (starts >= margin) & (stops + margin <= green.shape)
+    found = [
+        np.add(
+            _centroids(light[y - margin : y + high + margin, x - margin : x + wide + margin]),
+            (y, x),
+        )
+        for (y, x), (high, wide), good in zip(starts, sizes, whole & inside, strict=True)
+        if good.all()
+    ]
+    if len(found) < MIN_DOTS:
+        return None
+    points = np.array(found) - margin - (np.array(green.shape) - 1) / 2
+    grid = numbered(points[:, 1], MIN_DOTS)
+    return (grid[0], points[grid[1]]) if grid else None
+
+
+def _centroids(light: Doubles) -> Doubles:
+    """Return the centroids of a dark dot in red, green and blue, (3, 2): y, x.
+
+    White is a plane through the border of the window, because light may fall off.
+    """
+    y, x = np.mgrid[: light.shape[0], : light.shape[1]]
+    border = np.ones(light.shape[:2], bool)
+    border[2:-2, 2:-2] = False
+    terms = np.stack([np.ones_like(y), y, x], axis=-1)
+    plane, *_ = np.linalg.lstsq(terms[border], light[border], rcond=None)
+    dark = terms @ plane - light
+    at = [(dark * axis[..., None]).sum((0, 1)) / dark.sum((0, 1)) for axis in (y, x)]
+    return np.stack(at, axis=-1)
+
+
+def dot_figures(numbers: Doubles, places: Doubles) -> dict[str, float]:
+    """Return distortion and lateral colour of a grid of dots.
+
+    ``distortion`` is the local geometric distortion (ISO 17850:2015) of the dot farthest from the
+    centre, in % of its distance from there; ``most_distortion`` the largest of all in size. The
+    undistorted grid is that of the central 25 dots. ``lateral_red`` and ``lateral_blue`` tell how
+    far red and blue are outside of green in the outermost tenth of the dots, px (ISO 19084:2015).
+
+    Args:
+        numbers: rows and columns from :func:`dot_grid`.
+        places: centres from there.
+    """
+    green = places[:, 1]
+    inner = np.abs(numbers).max(1) <= 2
+    terms = np.column_stack([np.ones(len(numbers)), numbers])
+    affine, *_ = np.linalg.lstsq(terms[inner], green[inner], rcond=None)
+    ideal = terms @ affine
+    radius = np.hypot(*ideal.T)
+    far = radius > 2 * np.hypot(*affine[1])
+    error = 100 * (np.hypot(*green[far].T) / radius[far] - 1)
+    outer = np.hypot(*green.T) >= np.percentile(np.hypot(*green.T), 90)
+    outwards = green[outer] / np.hypot(*green[outer].T)[:, None]
+    shift = ((places[outer] - green[outer, None]) * outwards[:, None]).sum(-1).mean(0)
+    return {
+        "distortion": float(error[radius[far].argmax()]),
+        "most_distortion": float(error[np.abs(error).argmax()]),
+        "lateral_red": float(shift[0]),
+        "lateral_blue": float(shift[2]),
+    }
+
+
+def shading(light: Doubles) -> dict[str, float]:
+    """Return the shading of a flat field: light in the corners over that in the centre, in %.
+
+    ``color_shading`` is the largest difference of red or blue over green there, in %.
+
+    >>> shading(np.ones((64, 96, 3)))
+    {'shading': 100.0, 'color_shading': 0.0}
+
+    Args:
+        light: linear RGB, (height, width, 3).
+    """
+    block = max(light.shape[:2]) // BLOCKS
+    means = in_blocks(light, block).mean((1, 3))
+    rows, columns = (n // 2 for n in means.shape[:2])
+    centre = means[rows - 1 : rows + 1, columns - 1 : columns + 1].mean((0, 1))
+    corners = means[[0, 0, -1, -1], [0, -1, 0, -1]].mean(0)
+    ratio = corners / centre
+    colour = ratio[[0, 2]] / ratio[1] - 1
+    return {
+        "shading": float(100 * ratio[1]),
+        "color_shading": float(100 * np.abs(colour).max()),
+    }
+
+
+def glare(light: Doubles) -> float:
+    """Return the light in the centre of a black spot over that around it, in % (ISO 18844:2017).
+
+    Args:
+        light: linear RGB, (height, width, 3), of a spot whose diameter is a tenth of the shorter
+            side.
+    """
+    height, width = light.shape[:2]
+    reach = min(height, width) // 50
+    spot = light[height // 2 - reach : height // 2 + reach, width // 2 - reach : width // 2 + reach]
+    around = light[height // 2 - reach : height // 2 + reach, : width // 4]
+    return float(100 * spot[..., 1].mean() / around[..., 1].mean())

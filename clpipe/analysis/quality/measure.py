@@ -1,0 +1,228 @@
+"""Measures the image quality of a chain on its charts, and of pictures of real charts."""
+
+from dataclasses import asdict
+
+import numpy as np
+
+from clpipe.analysis.quality import lens
+from clpipe.analysis.quality.charts import (
+    CHECKER,
+    GREY,
+    checker,
+    dead_leaves,
+    dots,
+    glare_spot,
+    grey,
+    grey_steps,
+    patch_image,
+    patches_of,
+    slanted_edge,
+)
+from clpipe.analysis.quality.colour import checker_errors
+from clpipe.analysis.quality.greys import GreyPatches
+from clpipe.analysis.quality.report import CONTRASTS, MAIN, Curve, Quality, edge_figure
+from clpipe.analysis.quality.simulation import ChartCamera
+from clpipe.analysis.quality.texture import texture_mtf
+from clpipe.analysis.quality.visual_noise import acutance
+from clpipe.analysis.sharpness import (
+    CURVES,
+    FREQUENCIES,
+    Edge,
+    edge_of,
+    edges_in,
+    frequency_at,
+    median_edge,
+)
+from clpipe.base.types import Array, Doubles
+from clpipe.chain.settings import Settings
+from clpipe.engine.service import Service
+from clpipe.reference.transfer import inverse_srgb_curve
+
+ANGLES = (5.0, 20.0, 70.0, 85.0)  # degrees, of the edges' normals against rows
+EDGE = 160  # px, of a chart of an edge
+FRAMES = {"edge": 12, "greys": 4, "lens": 4}  # with their own noise, that are averaged or pooled
+DETECTED = 0.9
+SHOWN = np.s_[: len(FREQUENCIES) // 2 + 1]  # up to 0.5 cycles/px
+SFR, TEXTURE, TONE, SNR, VISIBLE, CDP = (
+    "Edge MTF over cycles/px",
+    "Texture MTF over cycles/px",
+    "Level over EV from middle grey",
+    "SNR in dB over EV from middle grey",
+    "Visual noise over EV from middle grey",
+    "Detection of a 2:1 contrast over EV from middle grey",
+)
+Found = tuple[dict[str, float], dict[tuple[str, str], Curve]]
+
+
+def chain_quality(
+    name: str, settings: Settings, service: Service, width: int, height: int
+) -> Quality:
+    """Return the image quality of a chain.
+
+    Args:
+        name: of the camera in the report.
+        settings: of the chain.
+        service: the service that develops the charts.
+        width: of the picture, px, in which figures of the lens are measured.
+        height: of that picture.
+
+    Raises:
+        RequestError: the chain cannot be built, or has no finished picture.
+        ImageError: a chart cannot be developed.
+    """
+    camera = ChartCamera(settings, service)
+    greys = developed_greys(camera)
+    parts: tuple[Found, ...] = (
+        _edges(camera),
+        _texture(camera),
+        grey_figures(greys, 2),
+        _colours(camera),
+        (_lens(camera, greys, width, height), {}),
+    )
+    figures = {key: value for own, _ in parts for key, value in own.items()}
+    curves = {key: value for _, own in parts for key, value in own.items()}
+    return Quality(name, figures, curves)
+
+
+def light_of(levels: Array) -> Doubles:
+    """Return the linear light of sRGB levels, 0 to 255."""
+    return inverse_srgb_curve(np.asarray(levels, np.float64) / 255)
+
+
+def developed_greys(camera: ChartCamera) -> GreyPatches:
+    """Return pictures of the grey patches."""
+    light = grey_steps()
+    frames = camera.frames(patch_image(light[:, None].repeat(3, 1)), "greys", FRAMES["greys"])
+    return GreyPatches(light, patches_of(frames.astype(np.float64)))
+
+
+def _edges(camera: ChartCamera) -> Found:
+    """Return the figures and curves of slanted edges."""
+    figures: dict[str, float] = {}
+    curves: dict[tuple[str, str], Curve] = {}
+    for contrast in CONTRASTS:
+        edges: list[Edge] = []
+        capacities: list[float] = []
+        for angle in ANGLES:
+            render = slanted_edge(contrast, angle, EDGE)
+            frames = camera.frames(render, f"edge {contrast} {angle}", FRAMES["edge"])
+            # Single frames have the noise of a picture; their mean has the sharper edge.
+            found = edge_of(light_of(frames.mean(0)))
+            edges += [found] if found else []
+            single = edge_of(light_of(frames[0]))
+            capacities += [single.capacity] if single else []
+        if not edges:
+            continue
+        own, shown = edge_found(median_edge(edges), contrast)
+        figures, curves = figures | own, curves | shown
+        if contrast == MAIN:
+            figures["capacity"] = float(np.median(capacities)) if capacities else np.nan
+    return figures, curves
+
+
+def edge_found(edge: Edge, contrast: float) -> Found:
+    """Return the figures and curves of an edge with a contrast."""
+    values = {
+        "mtf50": edge.mtf50,
+        "mtf10": edge.mtf10,
+        "nyquist": edge.nyquist,
+        "overshoot": 100 * edge.overshoot,
+        "undershoot": 100 * edge.undershoot,
+    }
+    figures = {edge_figure(key, contrast): value for key, value in values.items()}
+    if contrast == MAIN:
+        channels = zip(CURVES[1:], edge.mtf[1:], strict=True)
+        figures |= {f"mtf50_{name}": frequency_at(0.5, mtf) for name, mtf in channels}
+        figures |= {"edge_red": edge.red, "edge_blue": edge.blue, "capacity": edge.capacity}
+    return figures, {(SFR, f"{contrast:g}:1"): Curve(FREQUENCIES[SHOWN], edge.mtf[0][SHOWN])}
+
+
+def _texture(camera: ChartCamera) -> Found:
+    """Return the figures and curve of a texture; NaN if the picture has another size."""
+    chart = dead_leaves()
+    [picture] = camera.frames(chart, "texture")
+    if picture.shape != chart.shape:
+        return {"texture_mtf50": np.nan, "acutance": np.nan}, {}
+    return texture_found(texture_mtf(light_of(picture), chart.astype(np.float64)))
+
+
+def texture_found(mtf: Doubles) -> Found:
+    """Return the figures and curve of a texture's MTF, up to 0.5 cycles/px."""
+    at = FREQUENCIES[SHOWN]
+    figures = {"texture_mtf50": frequency_at(0.5, mtf), "acutance": acutance(mtf, at)}
+    return figures, {(TEXTURE, ""): Curve(at, mtf)}
+
+
+def grey_figures(greys: GreyPatches, step: int) -> Found:
+    """Return the figures and curves of grey patches.
+
+    Args:
+        greys: the patches.
+        step: the number of patches between those whose contrast is detected.
+    """
+    stops, visible = np.log2(greys.light / GREY), greys.visual_noise()
+    light, detected = greys.detection(step)
+    missed = np.flatnonzero(detected < DETECTED)
+    below = light[light < GREY]
+    dark = missed[missed < len(below)]
+    first = light[dark[-1] + 1] if len(dark) else light[0]
+
+    def at_grey(values: Doubles) -> float:
+        known = np.isfinite(values)
+        return float(np.interp(0.0, stops[known], values[known])) if known.any() else np.nan
+
+    figures = {
+        "snr": at_grey(greys.snr),
+        "visual_noise": at_grey(visible),
+        "dynamic_range": greys.dynamic_range,
+        "grey_level": at_grey(greys.luma),
+        "gamma": at_grey(greys.gamma),
+        "clipping": float(np.log2(greys.saturation / GREY)),
+        "black": float(greys.luma[0]),
+        "detection": float(np.log2(first / GREY)),
+    }
+    curves = {
+        (TONE, ""): Curve(stops, greys.luma),
+        (SNR, ""): Curve(stops, greys.snr),
+        (VISIBLE, ""): Curve(stops, visible),
+        (CDP, ""): Curve(np.log2(light / GREY), detected),
+    }
+    return figures, curves
+
+
+def _colours(camera: ChartCamera) -> Found:
+    """Return the errors of a ColorChecker under D65 and under light A."""
+    true = np.array(CHECKER, np.float64)
+    errors = []
+    for under_a in (False, True):
+        frames = camera.frames(patch_image(checker(under_a)), f"colours {under_a}")
+        errors.append(asdict(checker_errors(patches_of(frames).mean((1, 2, 3)), true)))
+    by_day, by_lamp = errors
+    figures = {key: value for key, value in by_day.items() if key != "grey_level"}
+    return {**figures, **{f"{key}_a": by_lamp[key] for key in ("delta_e", "white_balance")}}, {}
+
+
+def _lens(camera: ChartCamera, greys: GreyPatches, width: int, height: int) -> dict[str, float]:
+    """Return the figures of the lens, from charts that fill the picture."""
+    flat = np.full((height, width), GREY)
+    renders = {"flat": grey(flat), "dots": dots(width, height), "glare": glare_spot(width, height)}
+    field, dotted, spot = (
+        camera.frames(render, name, FRAMES["lens"], whole=True).mean(0)
+        for name, render in renders.items()
+    )
+    tiled = np.tile(slanted_edge(MAIN, 20.0), (height // 120 + 1, width // 120 + 1, 1))
+    [edges] = camera.frames(tiled[:height, :width], "corners", whole=True)
+    middle = np.s_[height // 2 - 120 : height // 2 + 120, width // 2 - 120 : width // 2 + 120]
+    corners = [
+        np.s_[y, x] for y in (np.s_[:240], np.s_[-240:]) for x in (np.s_[:240], np.s_[-240:])
+    ]
+    outer, inner = ([e for at in part for e in edges_in(edges[at])] for part in (corners, [middle]))
+    grid = lens.dot_grid(light_of(dotted))
+    figures = {
+        **lens.shading(greys.light_at(field)),
+        **(lens.dot_figures(*grid) if grid else {}),
+        "glare": lens.glare(greys.light_at(spot)),
+    }
+    if outer and inner:
+        figures["corners"] = 100 * median_edge(outer).mtf50 / median_edge(inner).mtf50
+    return figures
