@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clpipe.analysis.quality.charts import CHECKER, checker, patch_image, patches_of
+from clpipe.analysis.quality.colour import checker_errors
 from tests.conftest import cli_output
-from tools.compare import charts, fidelity
 from tools.compare import converters as tool
-from tools.compare.charts import chart_image, chart_patches, patch_means
-from tools.compare.fidelity import colour_errors
+from tools.compare import fidelity
 from tools.shared import options, pictures, tables
 
 pytestmark = pytest.mark.slow
@@ -68,23 +68,23 @@ def test_a_sheet_holds_the_pictures_between_their_captions():
     assert np.array_equal(named[:, -page.shape[1] :], page)
 
 
-@pytest.mark.parametrize("module", [charts, fidelity, options, tables])
+@pytest.mark.parametrize("module", [fidelity, options, tables])
 def test_the_examples_in_docstrings(module):
     assert doctest.testmod(module).failed == 0
 
 
 def test_errors_of_grey_hue_and_chroma_are_independent():
-    true = chart_patches()
-    brighter = colour_errors(true * 1.05, true)
-    assert brighter.grey == pytest.approx(128.1)
+    true = np.array(CHECKER, float)
+    brighter = checker_errors(true * 1.05, true)
+    assert brighter.grey_level == pytest.approx(128.1)
     assert brighter.lightness > 2 > 1 > brighter.hue
     grey = true.mean(1, keepdims=True)
-    assert colour_errors(grey + (true - grey) / 2, true).chroma == pytest.approx(0.5, abs=0.05)
+    assert checker_errors(grey + (true - grey) / 2, true).chroma == pytest.approx(0.5, abs=0.05)
     only_red = true.copy()
     only_red[14] = only_red[14, [0, 2, 1]] + (0, 60, 0)  # red towards orange
-    turned = colour_errors(only_red, true)
+    turned = checker_errors(only_red, true)
     assert turned.hue == 0
-    assert 20 < turned.largest_hue < 60
+    assert 20 < turned.most_hue < 60
     assert turned.chroma == 1
 
 
@@ -114,20 +114,21 @@ def test_our_dng_is_as_bright_as_our_picture_in_other_converters(
     noisy = iso > 100
     # dcraw darkens the picture for brighter light.
     has_ramp = not noisy and converter.name != "dcraw"
-    chart = chart_image()
+    chart = patch_image(checker())
     if has_ramp:
         ramp = np.linspace(0, 1.9, chart.shape[1], dtype=np.float32)
         chart = np.concatenate([chart, np.broadcast_to(ramp[None, :, None], chart.shape)])
     formats = ("--format", "dng", "--format", "png", "--truth", "development")
-    large = pictures.enlarged(chart, 4)
+    large = pictures.enlarged(chart, 2)
     cli_output("run", write_exr("chart.exr", large), "-o", tmp_path, "--iso", iso, *formats)
     picture = tmp_path / "made" / "chart.png"
     tool.convert(converter, tmp_path / f"chart{'' if noisy else '.truth'}.dng", picture)
     pixels = tool.read_picture(picture, *large.shape[:2])
-    small = pixels.reshape(-1, 4, 384, 4, 3).mean((1, 3))
-    found = colour_errors(patch_means(small[:256]), chart_patches())
-    assert 100 <= found.grey <= 140
+    small = pixels.reshape(-1, 2, 768, 2, 3).mean((1, 3))
+    means = patches_of(small[None, :512]).mean((1, 2, 3))
+    found = checker_errors(means, np.array(CHECKER))
+    assert 100 <= found.grey_level <= 140
     assert found.hue < 3
     if has_ramp:
-        bright = small[320:448, 200::40].mean((0, 2))
+        bright = small[640:896, 400::80].mean((0, 2))
         assert (np.diff(bright) > 0.5).all(), bright

@@ -31,7 +31,7 @@ from clpipe.analysis.matching.columns import (
     noise_of_frames,
     signature,
 )
-from clpipe.analysis.matching.edges import as_sharp
+from clpipe.analysis.matching.edges import as_sharp, edge_in
 from clpipe.analysis.matching.result import ended_by
 from clpipe.analysis.matching.scenes import Scene, Scenes, expand, load_scenes, with_holdout
 from clpipe.analysis.matching.simulation import Simulator
@@ -591,7 +591,7 @@ def test_edges_of_looks_are_like_the_cameras(look, device, shared_data):
     pictures = f"{shared_data}/real_noise/{PAIRS[look]}"
     scenes = load_scenes([f"{pictures}_?_real.png"], [f"{pictures}_?_mean.png"]).each
     own = load_settings(look)
-    settings, sharpness = as_sharp(own, scenes, device)
+    settings, sharpness = as_sharp(own, edge_in(scenes), device)
     assert sharpness is not None
     assert sharpness.ours.mtf50 == pytest.approx(sharpness.theirs.mtf50, abs=0.03)
     found, set_to = (s.parameters["optical_blur"]["sigma"] for s in (settings, own))

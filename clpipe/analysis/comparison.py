@@ -11,11 +11,13 @@ from clpipe.analysis.crops import Crop, choose_crops
 from clpipe.analysis.measure import measure
 from clpipe.analysis.pictures import Picture, load_picture
 from clpipe.analysis.report import json_object
+from clpipe.analysis.sharpness import edges_in, sharpest
 from clpipe.analysis.spatial import energy_left
 from clpipe.base.errors import RequestError
 from clpipe.base.text import one_line
 from clpipe.base.types import Doubles, Floats
 from clpipe.reference.colour import luma
+from clpipe.reference.curve import to_8_bit
 from clpipe.reference.transfer import srgb_curve
 
 LEVELS = 255  # sigmas are in 8-bit levels
@@ -40,6 +42,21 @@ class Noise:
 
 
 @dataclass(frozen=True)
+class Look:
+    """The sharpest quarter of a picture's edges, and its tone. NaN is unknown.
+
+    Args:
+        mtf50: their MTF50, cycles/px.
+        overshoot: their overshoot, a share of the contrast.
+        level: the median of luma in levels of 255.
+    """
+
+    mtf50: float
+    overshoot: float
+    level: float
+
+
+@dataclass(frozen=True)
 class Row:
     """A row of a figure: its name, and a crop (or difference) for each picture, 0..1."""
 
@@ -55,12 +72,17 @@ class Comparison:
     places: tuple[Crop, ...]
     rows: tuple[Row, ...]
     noise: tuple[Noise, ...]  # noise of each picture; empty if unknown
+    looks: tuple[Look, ...]
     notes: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:
         """Return the figure's content without pixels, as JSON values; unknown numbers are None."""
         return json_object(
-            labels=self.labels, places=self.places, noise=self.noise, notes=self.notes
+            labels=self.labels,
+            places=self.places,
+            noise=self.noise,
+            looks=self.looks,
+            notes=self.notes,
         )
 
 
@@ -122,7 +144,8 @@ def compare(
         notes = [f"levels of 255; sigma: of luma in the flat place; {LEFT}"]
     if linear := [name for name, one in zip(names, loaded, strict=True) if one.kind != "display"]:
         notes.append(f"linear, shown through sRGB's curve: {', '.join(linear)}")
-    return Comparison(names, tuple(places), tuple(rows), tuple(noise), tuple(notes))
+    looks = tuple(map(_look, pictures))
+    return Comparison(names, tuple(places), tuple(rows), tuple(noise), looks, tuple(notes))
 
 
 def _check_counts(paths: Sequence[Path], labels: Sequence[str], truths: Sequence[Path]) -> None:
@@ -216,6 +239,13 @@ def _against_truth(picture: Picture, truth: Picture) -> Noise:
     (light,) = (one for one in measure([picture], truth).channels if one.name == "Y")
     rms = float(np.sqrt(np.square(picture.pixels - truth.pixels).mean(dtype=np.float64)))
     return Noise(rms * LEVELS, light.sigma * LEVELS, light.energy_left_2x2)
+
+
+def _look(picture: Picture) -> Look:
+    """Return the sharpness and the level of a picture for display."""
+    edge = sharpest(edges_in(to_8_bit(picture.pixels)))
+    sharp = (edge.mtf50, edge.overshoot) if edge else (np.nan, np.nan)
+    return Look(*sharp, float(np.median(luma(picture.pixels))) * LEVELS)
 
 
 def _flat_noise(picture: Picture, place: Crop) -> Noise:

@@ -16,6 +16,7 @@ from clpipe.reference.transfer import inverse_srgb_curve
 
 SIDE = 28  # px, of the windows in which edges are sought
 STEP = 7  # px between windows
+MOST_WINDOWS = 50_000  # in large pictures, fewer are tried
 REACH = 9  # px of the profile to each side of an edge that is sought
 WIDE = 20  # px, of an edge that fills its picture
 FLAT = 3  # px at each end of the profile that belong to the plateaus
@@ -76,9 +77,10 @@ def edges_in(picture: Array) -> list[Edge]:
     luma = light @ LUMINANCE
     slopes = np.stack(np.gradient(luma))
     height, width = luma.shape
+    step = max(STEP, int((luma.size / MOST_WINDOWS) ** 0.5))
     found = []
-    for y in range(0, height - SIDE + 1, STEP):
-        for x in range(0, width - SIDE + 1, STEP):
+    for y in range(0, height - SIDE + 1, step):
+        for x in range(0, width - SIDE + 1, step):
             window = np.s_[y : y + SIDE, x : x + SIDE]
             levels = picture[window]
             if np.ptp(luma[window]) >= MIN_CONTRAST and levels.max() < 253 and levels.min() > 1:

@@ -81,7 +81,8 @@ def compare(
 
     The noise of each picture is printed below its crops. With --truth it is measured like in
     'clpipe measure', with the rms of the whole picture. Without --truth it is that of the flat
-    area.
+    area. The printed table also has MTF50 and overshoot of the sharpest quarter of edges, and the
+    median level.
 
     \b
     clpipe run render.exr -o shots --iso 100,3200
@@ -99,18 +100,27 @@ def compare(
         show_json({"figures": [str(output) for output in outputs], **found.record()})
         return
     show(("place", "crop"), [(place.name, place.box) for place in found.places])
-    if found.noise:
-        click.echo()
-        show_noise(found)
+    click.echo()
+    show_figures(found)
     for note in found.notes:
         click.echo(note)
     click.echo(f"wrote {' and '.join(map(str, outputs))}")
 
 
-def show_noise(found: Comparison) -> None:
-    """Print a table with the noise of each picture."""
+def show_figures(found: Comparison) -> None:
+    """Print a table with the noise, the sharpness and the tone of each picture."""
+    headings = ["picture", "rms", "sigma", "2x2 leaves", "MTF50", "overshoot", "level"]
     rows = [
-        (label, number(one.rms, ".2f"), number(one.sigma, ".2f"), number(one.left, ".2f"))
-        for label, one in zip(found.labels, found.noise, strict=True)
+        (number(look.mtf50, ".3f"), number(look.overshoot, ".1%"), number(look.level, ".0f"))
+        for look in found.looks
     ]
-    show(("picture", "rms", "sigma", "2x2 leaves"), rows, left=1)
+    noise = [
+        (number(one.rms, ".2f"), number(one.sigma, ".2f"), number(one.left, ".2f"))
+        for one in found.noise
+    ]
+    columns = [found.labels, *zip(*noise, strict=True), *zip(*rows, strict=True)]
+    show(
+        headings[:1] + headings[len(headings) - len(columns) + 1 :],
+        zip(*columns, strict=True),
+        left=1,
+    )

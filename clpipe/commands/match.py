@@ -21,7 +21,7 @@ from clpipe.chain.settings import Settings
 from clpipe.chain.toml import value_text
 from clpipe.commands.chain_options import device_option, option
 from clpipe.commands.notices import NOTICES
-from clpipe.commands.options import Command, OutputPath, json_option, output_option
+from clpipe.commands.options import EXISTING, Command, OutputPath, json_option, output_option
 from clpipe.commands.printing import Rows, number, show, show_json
 from clpipe.commands.progress import LINE_INTERVAL
 
@@ -100,6 +100,16 @@ class SearchProgress(Watch):
     help="The mean of many pictures of each FRAME's scene, in the same order: a file or a quoted "
     "glob. May be repeated. [default: the FRAMEs are a burst of one scene]",
 )
+@click.option(
+    "--chart",
+    "charts",
+    multiple=True,
+    type=EXISTING,
+    metavar="PICTURE",
+    help="A picture of a slanted edge or a ColorChecker by the same camera. Edges set the blur and "
+    "the limit of sharpening, and greys set the tone curve. May be repeated. [default: edges of "
+    "the FRAMEs; the search chooses the tone curve]",
+)
 @option(KEYS["camera"])
 @option(
     KEYS["iso"]._replace(
@@ -119,6 +129,7 @@ def match(
     frames: tuple[str, ...],
     output: Path,
     means: tuple[str, ...],
+    charts: tuple[Path, ...],
     camera: str | None,
     iso: float | None,
     plot: Path | None,
@@ -142,7 +153,7 @@ def match(
     search = SearchProgress(output, Console(stderr=True))
     try:
         with interruptible(search.stop), search:
-            result = match_files(frames, means, camera, iso, selector, search)
+            result = match_files(frames, means, camera, iso, selector, charts, search)
     except StoppedError:
         click.echo(f"stopped: {search.state}", err=True)
         raise click.exceptions.Exit(INTERRUPTED) from None

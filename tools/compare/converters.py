@@ -22,17 +22,18 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from clpipe.analysis.quality.charts import CHECKER, checker, patch_image, patches_of
+from clpipe.analysis.quality.colour import checker_errors
 from clpipe.base.types import Array
 from clpipe.images.write import write_exr
 from tools import ROOT
-from tools.compare.charts import chart_image, chart_patches, patch_means
-from tools.compare.fidelity import colour_errors
 from tools.shared.options import parser_of
 from tools.shared.pictures import enlarged
 from tools.shared.tables import markdown
 
 LIMIT = 600  # seconds for each development
-SCALE = 4  # enlargement of the chart
+CHART = patch_image(checker())
+SCALE = 2  # enlargement of the chart
 BORDER = 8  # px that a converter may crop on each side; RawTherapee crops 4
 WHITE = 18  # the number of the white patch
 
@@ -126,11 +127,12 @@ def run(command: Sequence[str], **variables: str) -> bytes:
 
 def row(name: str, picture: Path) -> list[str]:
     """Return the table's row of a development of the chart."""
-    height, width = (side * SCALE for side in chart_image().shape[:2])
-    means = patch_means(read_picture(picture, height, width)[::SCALE, ::SCALE])
-    of = colour_errors(means, chart_patches())
-    hue = f"{of.hue:.1f} / {of.largest_hue:.1f}"
-    return [name, f"{of.grey:.0f}", f"{means[WHITE, 1]:.0f}", hue]
+    height, width = (side * SCALE for side in CHART.shape[:2])
+    small = read_picture(picture, height, width)[None, ::SCALE, ::SCALE]
+    means = patches_of(small).mean((1, 2, 3))
+    of = checker_errors(means, np.array(CHECKER))
+    hue = f"{of.hue:.1f} / {of.most_hue:.1f}"
+    return [name, f"{of.grey_level:.0f}", f"{means[WHITE, 1]:.0f}", hue]
 
 
 def compare(out: Path, configs: Sequence[str], converters: Sequence[Converter]) -> list[list[str]]:
@@ -140,7 +142,7 @@ def compare(out: Path, configs: Sequence[str], converters: Sequence[Converter]) 
         ComparisonError: a program fails.
     """
     out.mkdir(parents=True, exist_ok=True)
-    write_exr(out / "chart.exr", enlarged(chart_image(), SCALE), "RGB", {})
+    write_exr(out / "chart.exr", enlarged(CHART, SCALE), "RGB", {})
     rows = []
     for number, config in enumerate(configs):
         command = [sys.executable, "-m", "clpipe", "run", str(out / "chart.exr"), "--iso", "100"]

@@ -1,76 +1,16 @@
-"""Measures the fidelity of finished pictures: colours, brightness, edges and sharpness.
+"""Measures what demosaicing and noise do to finished pictures: dots, and the distance of two.
 
 All pictures are in sRGB levels, 0 to 255.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clpipe.base.types import Doubles
-from clpipe.camera.profile import SRGB_TO_XYZ
 from clpipe.reference.colour import luma
-from tools.compare.charts import GREY, linear
 
-HAS_HUE = 10.0  # the lowest CIELAB chroma at which hues are compared
 DOT = 32  # levels of luma between a dot and the median of its 3x3
 SMOOTH = 16  # the largest such difference in the reference, so that a dot is visible
-
-
-def cielab(levels: NDArray[np.number]) -> Doubles:
-    """Convert sRGB levels to CIELAB under D65, (..., 3): L*, a*, b* (CIE 15:2018, eq. 8.3 to 8.11).
-
-    >>> cielab(np.array([[255, 255, 255], [122, 122, 122], [255, 0, 0]])).round(1).tolist()
-    [[100.0, 0.0, 0.0], [51.2, 0.0, 0.0], [53.2, 80.1, 67.2]]
-    """
-    ratio = linear(levels) @ (SRGB_TO_XYZ / SRGB_TO_XYZ.sum(1, keepdims=True)).T
-    x, y, z = np.moveaxis(
-        np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29), -1, 0
-    )
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
-
-
-@dataclass(frozen=True)
-class ColourErrors:
-    """Errors of a chart's patches in CIELAB.
-
-    Hue and chroma are compared only for patches with a chroma of at least 10.
-    """
-
-    grey: float  # level of green of the grey patch; 122 in the chart
-    lightness: float  # mean difference of L*
-    hue: float  # median error, degrees
-    largest_hue: float  # degrees
-    chroma: float  # median ratio to the chart's
-
-
-def colour_errors(pictured: NDArray[np.number], true: NDArray[np.number]) -> ColourErrors:
-    """Compare the patches of a picture of a ColorChecker with their true colours.
-
-    Args:
-        pictured: (24, 3).
-        true: (24, 3), as from :func:`~tools.compare.charts.chart_patches`.
-
-    >>> from tools.compare.charts import chart_patches
-    >>> true = chart_patches()
-    >>> colour_errors(true, true)
-    ColourErrors(grey=122.0, lightness=0.0, hue=0.0, largest_hue=0.0, chroma=1.0)
-    """
-    found, expected = cielab(pictured), cielab(true)
-    (found_chroma, found_hue), (chroma, hue) = (
-        (np.hypot(lab[:, 1], lab[:, 2]), np.arctan2(lab[:, 2], lab[:, 1]))
-        for lab in (found, expected)
-    )
-    coloured = chroma >= HAS_HUE
-    hue_errors = np.degrees(np.abs((found_hue - hue + np.pi) % (2 * np.pi) - np.pi))[coloured]
-    return ColourErrors(
-        grey=float(pictured[GREY, 1]),
-        lightness=float((found[:, 0] - expected[:, 0]).mean()),
-        hue=float(np.median(hue_errors)),
-        largest_hue=float(hue_errors.max()),
-        chroma=float(np.median(found_chroma[coloured] / chroma[coloured])),
-    )
 
 
 def dots(picture: NDArray[np.number], reference: NDArray[np.number]) -> float:

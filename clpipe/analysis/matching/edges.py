@@ -38,20 +38,18 @@ class Sharpness:
 
 
 def as_sharp(
-    settings: Settings, scenes: Sequence[Scene], device: Device | None
+    settings: Settings, theirs: Edge | None, device: Device | None
 ) -> tuple[Settings, Sharpness | None]:
-    """Return settings with edges as sharp as in the scenes' means, and the figures of both.
+    """Return settings with edges as sharp as a camera's, and the figures of both.
 
-    The settings do not change, and there are no figures, if the means have fewer than 12 straight
-    edges, or the chain lacks ``optical_blur`` or ``sharpen``.
+    The settings do not change, and there are no figures, without an edge of the camera, or if the
+    chain lacks ``optical_blur`` or ``sharpen``.
 
     Args:
         settings: of the development.
-        scenes: of a camera.
+        theirs: of the camera, see :func:`edge_in`.
         device: the device that develops edges; None is NumPy.
     """
-    means = [scene.clean.round().astype("uint8") for scene in scenes]
-    theirs = sharpest([edge for mean in means for edge in edges_in(mean)])
     if theirs is None or not {"optical_blur", "sharpen"} <= set(settings.step_names):
         return settings, None
     renders = [slanted_edge(CONTRAST, angle) for angle in ANGLES]
@@ -75,6 +73,12 @@ def as_sharp(
         sigma = _solved(too_blunt, *SIGMAS, limit)
     found = round(sigma, 3), round(limit, 4)
     return over(*found), Sharpness(theirs, ours(*found))
+
+
+def edge_in(scenes: Sequence[Scene]) -> Edge | None:
+    """Return the sharpest edges of the scenes' means; None if they have fewer than 12."""
+    means = [scene.clean.round().astype("uint8") for scene in scenes]
+    return sharpest([edge for mean in means for edge in edges_in(mean)])
 
 
 def picture(runner: Runner, render: Array) -> Array:

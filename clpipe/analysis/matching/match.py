@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from clpipe.analysis.matching.charts import as_toned, read_charts
 from clpipe.analysis.matching.result import Match, measured
 from clpipe.analysis.matching.scenes import load_scenes
 from clpipe.analysis.matching.search import Search, Watch
@@ -30,6 +31,7 @@ def match_files(
     camera: str | None = None,
     iso: float | None = None,
     device: str | None = None,
+    charts: Sequence[Path] = (),
     watch: Watch | None = None,
 ) -> Match:
     """Find the development whose noise matches the noise of pictures.
@@ -40,6 +42,7 @@ def match_files(
         camera: the camera whose raw noise is developed; None is the default camera.
         iso: the ISO; None finds it.
         device: a device that ``clpipe devices`` lists, or "numpy"; None chooses.
+        charts: pictures of charts by the same camera, which set sharpness and tone.
         watch: receives the progress, and may stop the search.
 
     Raises:
@@ -52,6 +55,9 @@ def match_files(
     settings = overlay(Settings(), {k: v for k, v in values.items() if v is not None})
     check_cameras(settings)
     scenes = load_scenes(frames, means)
+    opened, seen, tone = open_device(device), read_charts(charts), None
+    if seen.greys is not None:
+        settings, tone = as_toned(settings, seen.greys, opened)
     space = space_for(settings, iso is not None)
-    search = Search(scenes, settings, space, open_device(device), watch)
-    return measured(search, search.run())
+    search = Search(scenes, settings, space, opened, watch)
+    return measured(search, search.run(), seen.edge, tone)

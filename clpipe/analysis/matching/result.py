@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clpipe.analysis.matching.ambiguity import Ambiguity, ambiguities
+from clpipe.analysis.matching.charts import Tone
 from clpipe.analysis.matching.columns import COLUMNS, SKEWS, TAILS, Noise
-from clpipe.analysis.matching.edges import Sharpness, as_sharp
+from clpipe.analysis.matching.edges import Sharpness, as_sharp, edge_in
 from clpipe.analysis.matching.scenes import Scenes
 from clpipe.analysis.matching.search import Candidate, Search, Target, target_at, target_of
 from clpipe.analysis.matching.space import DEVELOPMENT, TONE
 from clpipe.analysis.report import json_object
+from clpipe.analysis.sharpness import Edge
 from clpipe.base.files import write_new
 from clpipe.base.types import Mask
 from clpipe.chain.settings import Settings, overlay
@@ -22,7 +24,8 @@ from clpipe.chain.toml import value_text
 AT_END = 0.01  # share of the range; an ISO this close to an end counts as at the end
 NO_EDGES = (
     "the pictures have too few straight, isolated edges to measure their sharpness, so "
-    "optical_blur and sharpen.limit are the defaults; add pictures of objects with straight edges"
+    "optical_blur and sharpen.limit are the defaults; add pictures of objects with straight edges, "
+    "or a picture of a slanted edge (--chart)"
 )
 CHECKED = 4  # frames of each pair that are developed to measure the result
 
@@ -77,12 +80,13 @@ class Match:
     noises: tuple[Compared, ...]
     ambiguities: tuple[Ambiguity, ...]
     sharpness: Sharpness | None
+    tone: Tone | None = None
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences for a reader of the configuration: the verdict and the warnings."""
-        sharpness = [str(self.sharpness)] if self.sharpness else []
-        return (self.verdict, *sharpness, *self.warnings)
+        charts = [str(each) for each in (self.sharpness, self.tone) if each]
+        return (self.verdict, *charts, *self.warnings)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -117,6 +121,7 @@ class Match:
             notes=self.scenes.notes,
             ambiguities=self.ambiguities,
             sharpness=self.sharpness,
+            tone=self.tone,
             ended_by_range=ended_by(self.settings, self.numbers) or None,
             columns={
                 seen.name: {
@@ -145,14 +150,24 @@ def ended_by(settings: Settings, numbers: Mapping[str, float]) -> str:
     return ""
 
 
-def measured(search: Search, found: Candidate) -> Match:
+def measured(
+    search: Search, found: Candidate, edge: Edge | None = None, tone: Tone | None = None
+) -> Match:
     """Return the match of a candidate, developed with new noise and measured on all crops.
+
+    Args:
+        search: the search.
+        found: its result.
+        edge: of a chart; None takes those of the scenes.
+        tone: of a chart.
 
     Raises:
         StoppedError: the search's watch stopped it.
     """
     scenes = search.scenes
-    sharp, sharpness = as_sharp(found.settings, scenes.each, search.simulator.device)
+    sharp, sharpness = as_sharp(
+        found.settings, edge or edge_in(scenes.each), search.simulator.device
+    )
     settings = with_output(sharp, scenes)
     pairs: dict[bool, list[tuple[Target, Target]]] = {True: [], False: []}
     noises = []
@@ -174,6 +189,7 @@ def measured(search: Search, found: Candidate) -> Match:
         tuple(noises),
         ambiguities(search, found),
         sharpness,
+        tone,
     )
 
 

@@ -292,7 +292,7 @@ class Search:
     def dimensions(self, settings: Settings) -> list[Dimension]:
         """Return the numbers that are searched for some settings."""
         strength = [self.space.strength] if self.space.strength else []
-        return [*strength, *dimensions_of(make_chain(settings))]
+        return [*strength, *dimensions_of(make_chain(settings), self.space.is_toned)]
 
     def scaled(
         self, settings: Settings, numbers: Mapping[str, float], target: Target

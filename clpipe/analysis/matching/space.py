@@ -92,10 +92,14 @@ class Choice:
 
 @dataclass(frozen=True)
 class Space:
-    """The choices to compare, by part, and the number that sets the strength of noise, if any."""
+    """The choices to compare, by part, and the number that sets the strength of noise, if any.
+
+    ``is_toned`` is set if a chart has set the tone curve, so that it is not searched.
+    """
 
     choices: Mapping[str, tuple[Choice, ...]]
     strength: Dimension | None
+    is_toned: bool = False
 
     @cached_property
     def first(self) -> dict[str, Choice]:
@@ -114,17 +118,22 @@ def is_number(annotation: Any) -> bool:
     return annotation is float
 
 
-def dimensions_of(chain: Chain) -> list[Dimension]:
+def dimensions_of(chain: Chain, is_toned: bool = False) -> list[Dimension]:
     """Return the numbers of a chain's development that are kernel arguments, with their ranges.
 
     A share is searched from 0 to 1. Other numbers are searched within a factor of 8 of their value
     in the chain, as far as their limits allow. A number that is 0 is turned off, and stays 0.
     Numbers without an upper limit are not searched. Nor are numbers in units of the signal, because
     they follow from the noise.
+
+    Args:
+        chain: the chain.
+        is_toned: whether to leave out those of the tone curve.
     """
     found = []
+    searched = DEVELOPMENT if is_toned else (*DEVELOPMENT, TONE)
     for step in chain.steps:
-        if step.stage.name not in (*DEVELOPMENT, TONE):
+        if step.stage.name not in searched:
             continue
         for name, declared in type(step.method).model_fields.items():
             extra: Any = declared.json_schema_extra
@@ -167,7 +176,8 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
     if RESIZE not in settings.stages:
         choices[RESIZE] = (Choice("full size"), *smaller(settings))
     choices["chroma"] = tuple(chroma_options(settings))
-    for name in (*DEVELOPMENT, TONE):
+    is_toned = TONE in settings.parameters
+    for name in DEVELOPMENT if is_toned else (*DEVELOPMENT, TONE):
         stage = all_stages()[name]
         added = {} if name in settings.stages else {name: BEFORE}
         own = [
@@ -180,7 +190,7 @@ def space_for(settings: Settings, iso_is_given: bool) -> Space:
         choices[name] = (*without, *own)
     low, high = settings.isos().low, settings.isos().high
     strength = Dimension("iso", low, high, math.sqrt(low * high), logarithmic=True)
-    return Space(choices, None if iso_is_given else strength)
+    return Space(choices, None if iso_is_given else strength, is_toned)
 
 
 def smaller(settings: Settings) -> Iterator[Choice]:

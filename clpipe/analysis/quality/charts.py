@@ -71,6 +71,16 @@ def slanted_edge(contrast: float, angle: float, size: int = 120, middle: float =
     return grey(dark + (bright - dark) * share)
 
 
+def chroma_edge(size: int) -> Floats:
+    """Return an upright edge between a warm and a cold colour of one luminance, (size, size, 3)."""
+    warm, cold = np.array([0.25, 0.16, 0.12]), np.array([0.12, 0.2, 0.3])
+    luminance = SRGB_TO_XYZ[1]
+    row = np.where(
+        np.arange(size)[:, None] < size // 2, warm, cold * (warm @ luminance) / (cold @ luminance)
+    )
+    return np.tile(row.astype(np.float32), (size, 1, 1))
+
+
 def grey(light: Doubles) -> Floats:
     """Return a grey image, (height, width, 3), of its luminance."""
     return light.astype(np.float32)[..., None].repeat(3, 2)

@@ -74,7 +74,9 @@ class CheckerErrors:
         delta_e: mean CIEDE2000.
         most_delta_e: the largest CIEDE2000.
         delta_c: mean CIEDE2000 without the difference of lightness.
+        lightness: mean difference of L*.
         hue: median error of hue, degrees, of patches with a chroma of at least 10.
+        most_hue: the largest error of hue.
         chroma: median ratio of their chroma to the chart's.
         white_balance: the chroma of the mean of the grey patches; 0 is neutral.
         grey_axis: the largest chroma of a grey patch after this mean is subtracted.
@@ -84,7 +86,9 @@ class CheckerErrors:
     delta_e: float
     most_delta_e: float
     delta_c: float
+    lightness: float
     hue: float
+    most_hue: float
     chroma: float
     white_balance: float
     grey_axis: float
@@ -118,7 +122,9 @@ def checker_errors(pictured: Doubles, true: Doubles) -> CheckerErrors:
         delta_e=float(difference.mean()),
         most_delta_e=float(difference.max()),
         delta_c=float(delta_e_2000(expected, found, lightness=False).mean()),
+        lightness=float((found - expected)[:, 0].mean()),
         hue=float(np.median(hues)),
+        most_hue=float(hues.max()),
         chroma=float(np.median(found_chroma[coloured] / chroma[coloured])),
         white_balance=float(np.hypot(*cast)),
         grey_axis=float(np.hypot(*(greys - cast).T).max()),

@@ -9,6 +9,7 @@ from clpipe.analysis.quality.charts import (
     CHECKER,
     GREY,
     checker,
+    chroma_edge,
     dead_leaves,
     dots,
     glare_spot,
@@ -42,6 +43,8 @@ ANGLES = (5.0, 20.0, 70.0, 85.0)  # degrees, of the edges' normals against rows
 EDGE = 160  # px, of a chart of an edge
 FRAMES = {"edge": 12, "greys": 4, "lens": 4}  # with their own noise, that are averaged or pooled
 DETECTED = 0.9
+BLUE_DIFFERENCE = np.array([-0.1687, -0.3313, 0.5])  # of R, G and B in Cb (BT.601)
+RISE = 0.1, 0.9
 SHOWN = np.s_[: len(FREQUENCIES) // 2 + 1]  # up to 0.5 cycles/px
 SFR, TEXTURE, TONE, SNR, VISIBLE, CDP = (
     "Edge MTF over cycles/px",
@@ -77,7 +80,8 @@ def chain_quality(
         _texture(camera),
         grey_figures(greys, 2),
         _colours(camera),
-        (_lens(camera, greys, width, height), {}),
+        ({"chroma_edge": _chroma_edge(camera)}, {}),
+        (lens_figures(camera, greys, width, height), {}),
     )
     figures = {key: value for own, _ in parts for key, value in own.items()}
     curves = {key: value for _, own in parts for key, value in own.items()}
@@ -202,8 +206,27 @@ def _colours(camera: ChartCamera) -> Found:
     return {**figures, **{f"{key}_a": by_lamp[key] for key in ("delta_e", "white_balance")}}, {}
 
 
-def _lens(camera: ChartCamera, greys: GreyPatches, width: int, height: int) -> dict[str, float]:
-    """Return the figures of the lens, from charts that fill the picture."""
+def _chroma_edge(camera: ChartCamera) -> float:
+    """Return the distance over which chroma rises from 10 to 90 % at an edge of even luma, px."""
+    frames = camera.frames(chroma_edge(EDGE), "chroma edge", FRAMES["edge"])
+    rows = frames.mean((0, 1)) @ BLUE_DIFFERENCE
+    ends = rows[: EDGE // 4].mean(), rows[-EDGE // 4 :].mean()
+    rise = (rows - ends[0]) / (ends[1] - ends[0])
+    low, high = (np.interp(level, np.maximum.accumulate(rise), np.arange(EDGE)) for level in RISE)
+    return float(high - low)
+
+
+def lens_figures(
+    camera: ChartCamera, greys: GreyPatches, width: int, height: int
+) -> dict[str, float]:
+    """Return the figures of the lens, from charts that fill the picture.
+
+    Args:
+        camera: develops the charts.
+        greys: grey patches, from which levels are converted to light.
+        width: of the picture, px.
+        height: of the picture.
+    """
     flat = np.full((height, width), GREY)
     renders = {"flat": grey(flat), "dots": dots(width, height), "glare": glare_spot(width, height)}
     field, dotted, spot = (
@@ -224,5 +247,7 @@ def _lens(camera: ChartCamera, greys: GreyPatches, width: int, height: int) -> d
         "glare": lens.glare(greys.light_at(spot)),
     }
     if outer and inner:
-        figures["corners"] = 100 * median_edge(outer).mtf50 / median_edge(inner).mtf50
+        corner, centre = median_edge(outer), median_edge(inner)
+        figures |= {"corners": 100 * corner.mtf50 / centre.mtf50}
+        figures |= {"corner_red": corner.red, "corner_blue": corner.blue}
     return figures
