@@ -18,7 +18,7 @@ from clpipe.base.types import Doubles
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
-from clpipe.engine.service import Service, picture
+from clpipe.engine.service import Frame, Service
 from clpipe.reference.colour import luma
 
 FIRST = (1.0, 0.78, 0.72)  # exposure, toe and shoulder from which the fit starts
@@ -86,8 +86,8 @@ def as_toned(settings: Settings, greys: Doubles, device: Device | None) -> tuple
     def ours(values: Doubles) -> Doubles:
         exposure, *curve = map(float, values)
         chain = make_chain(overlay(settings, over(*curve))).without_noise()
-        developed = service.run(picture(chain, render * np.float32(exposure), "chart")).encoded
-        assert developed is not None
+        frame = Frame(chain, render * np.float32(exposure), "chart", encode=False, final=True)
+        developed = 255 * service.run(frame).image  # levels between the whole ones
         return np.asarray(
             luma(patches_of(developed[None])[: len(greys)].mean((1, 2, 3))), np.float64
         )

@@ -52,7 +52,8 @@ def delta_e_2000(one: Doubles, two: Doubles, lightness: bool = True) -> Doubles:
     c1, c2 = np.hypot(a1, b1), np.hypot(a2, b2)
     h1, h2 = (np.degrees(np.arctan2(b, a)) % 360 for a, b in ((a1, b1), (a2, b2)))
     grey = c1 * c2 == 0
-    turn = np.where(grey, 0, (h2 - h1 + 180) % 360 - 180)
+    turn = h2 - h1
+    turn = np.where(np.abs(turn) > 180 + 1e-9, turn - 360 * np.sign(turn), turn) * ~grey
     hue = 2 * np.sqrt(c1 * c2) * np.sin(np.radians(turn / 2))
     mean_h = np.where(grey, h1 + h2, h1 + turn / 2) % 360
     mean_l, mean_c = (l1 + l2) / 2, (c1 + c2) / 2

@@ -10,7 +10,8 @@ from clpipe.base.types import Doubles
 
 LUMINANCE = np.array([0.2125, 0.7154, 0.0721])  # weights of ISO 15739, for display values
 CHROMA = 0.279, 0.088  # weights of the variances of R-Y and B-Y in its noise
-CONTRAST, TOLERANCE = 2.0, 0.5  # of the patches whose contrast is to be detected
+TOLERANCE = 0.5  # of a contrast that is detected
+ROUNDING = 12**-0.5  # levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +48,13 @@ class GreyPatches:
     def snr(self) -> Doubles:
         """The signal-to-noise ratio of each patch, dB; NaN where the curve is flat.
 
-        It is 20 log10 of luminance times the curve's slope over the noise.
+        It is 20 log10 of luminance times the curve's slope over the noise, which is at least that
+        of rounding to whole levels.
         """
         signal = self.light * np.gradient(self.luma, self.light)
-        useful = (signal > 0) & (self.sigma > 1e-6) & ~(self.light >= self.saturation)
-        ratio = np.where(useful, signal, np.nan) / np.where(useful, self.sigma, np.nan)
-        return 20 * np.log10(ratio)
+        useful = (signal > 0) & ~(self.light >= self.saturation)
+        noise = np.maximum(self.sigma, ROUNDING)
+        return 20 * np.log10(np.where(useful, signal, np.nan) / noise)
 
     @property
     def gamma(self) -> Doubles:

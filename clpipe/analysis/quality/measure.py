@@ -208,11 +208,14 @@ def _colours(camera: ChartCamera) -> Found:
 
 def _chroma_edge(camera: ChartCamera) -> float:
     """Return the distance over which chroma rises from 10 to 90 % at an edge of even luma, px."""
-    frames = camera.frames(chroma_edge(EDGE), "chroma edge", FRAMES["edge"])
+    frames = camera.frames(chroma_edge(EDGE), "chroma edge", FRAMES["edge"], jpeg=True)
     rows = frames.mean((0, 1)) @ BLUE_DIFFERENCE
-    ends = rows[: EDGE // 4].mean(), rows[-EDGE // 4 :].mean()
+    side = len(rows)  # a chain may resize the picture
+    ends = rows[: side // 4].mean(), rows[-side // 4 :].mean()
+    if abs(ends[1] - ends[0]) < 1:  # a monochrome sensor
+        return np.nan
     rise = (rows - ends[0]) / (ends[1] - ends[0])
-    low, high = (np.interp(level, np.maximum.accumulate(rise), np.arange(EDGE)) for level in RISE)
+    low, high = (np.interp(level, np.maximum.accumulate(rise), np.arange(side)) for level in RISE)
     return float(high - low)
 
 

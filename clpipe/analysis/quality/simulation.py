@@ -16,13 +16,13 @@ from clpipe.stage import Kind
 
 SAME = RunOptions(unchanged=True)  # all frames have one render, which is uploaded once
 # Stages that need a scene with motion, depth or surroundings, and those that act by the place in
-# the picture, which charts in its centre do not show.
+# the picture or by the rest of it, which charts in its centre do not show.
 SCENE = ("projection", "shutter", "defocus")
-PLACE = ("distortion", "vignetting")
+PLACE = ("distortion", "vignetting", "glare")
 
 
 class ChartCamera:
-    """Develops charts to finished pictures, after a round trip through JPEG as in a run.
+    """Develops charts to finished pictures of eight bits.
 
     Args:
         settings: the settings of the chain. Draws are those of the name "quality".
@@ -51,7 +51,9 @@ class ChartCamera:
         output = own.output
         self._jpeg = JpegEncoding(output.jpeg_quality, output.jpeg_subsampling)
 
-    def frames(self, render: Floats, name: str, count: int = 1, whole: bool = False) -> Array:
+    def frames(
+        self, render: Floats, name: str, count: int = 1, whole: bool = False, jpeg: bool = False
+    ) -> Array:
         """Return pictures of a chart, each with its own noise, (frame, height, width, 3) uint8.
 
         A chain without noise has one frame.
@@ -62,9 +64,11 @@ class ChartCamera:
             count: the number of frames.
             whole: whether the chart is the whole picture, with the lens's effects by place, and not
                 a part of its centre.
+            jpeg: whether the pictures are encoded as JPEG in between, as in a run.
         """
         chain = make_chain(self._whole) if whole else self._central
         keys = [f"quality {name} {number}" for number in range(count if self.has_noise else 1)]
         ordered = [Frame(chain, render, key, options=SAME) for key in keys]
         found = [each.result().encoded for each in self._service.develop(ordered)]
-        return np.stack([jpeg_round_trip(each, self._jpeg) for each in found if each is not None])
+        pictures = [each for each in found if each is not None]
+        return np.stack([jpeg_round_trip(p, self._jpeg) for p in pictures] if jpeg else pictures)
