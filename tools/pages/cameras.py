@@ -12,6 +12,7 @@ from clpipe.analysis.quality.measure import chain_quality
 from clpipe.base.text import one_line
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.settings import settings_from
+from clpipe.commands.cameras import make_and_model
 from clpipe.engine.device import open_device
 from clpipe.engine.service import Service
 from tools import ROOT
@@ -27,11 +28,13 @@ FIGURES = {
 PAGE = ROOT / "docs" / "camera_quality.md"
 TEXT = """# Cameras by image quality
 
-The default chain with each built-in profile, measured by [`clpipe quality`](measuring.md#image-quality). `tools/run pages cameras` writes this page.
+The default chain with each built-in profile, measured by [`clpipe quality`](image_quality.md).
+`tools/run pages cameras` writes this page.
 
-A profile contains the noise, levels, colours and filter array of a sensor. It contains no lens and no development, so sharpness follows
-from the filter array and from the denoising, which follows the noise. Visual noise is for a middle grey, and is lower the less noise you
-see. A dash marks an ISO that the profile does not have, or a figure that no patch of the chart shows.
+A profile contains the noise, levels, colours and filter array of a sensor. It contains no lens and
+no development. Sharpness therefore follows from the filter array, and from the denoising, which
+follows the noise. Visual noise is for a middle grey, and is lower the less noise you see. A dash
+marks an ISO that the profile does not have, or a figure that no patch of the chart shows.
 
 """
 
@@ -56,7 +59,7 @@ def main() -> None:
             for report in reports
         ]
         print(name, *cells)
-        rows.append([f"`{name}`", one_line(f"{camera.make} {camera.model}"), *cells])
+        rows.append([f"`{name}`", one_line(make_and_model(camera)), *cells])
     heads = [f"{text}, ISO {iso}" for text in FIGURES for iso in ISOS]
     PAGE.write_text(TEXT + markdown(["profile", "camera", *heads], rows) + "\n", "utf-8")
     print(PAGE.relative_to(ROOT))
