@@ -401,7 +401,7 @@ def test_rejected_pictures_and_areas(pictures, tmp_path):
         return run_cli("quality", *arguments, status=status).stderr
 
     assert "no chart was found" in error(pictures["noise"], status=1)
-    assert "neither one straight edge" in error(pictures["noise"], "--roi", "0,0,100x100")
+    assert "this area has no edge" in error(pictures["noise"], "--roi", "0,0,100x100")
     assert "outside the pictures" in error(pictures["edge"], "--roi", "0,0,900x100")
     assert "name a PICTURE" in error("--roi", "0,0,10x10")
     assert "needs two areas" in error(pictures["spot"], "--roi", "black=0,0,50x50")
@@ -439,3 +439,19 @@ def test_match_takes_tone_and_sharpness_of_charts(camera, device, tmp_path):
     )
     assert np.abs(np.subtract(found.ours, found.theirs)).max() < 1.5
     assert "exposure" not in settings.parameters
+
+
+def test_compare_shows_sharpness_and_level(tmp_path):
+    from scipy.ndimage import gaussian_filter
+
+    sharp = np.tile(slanted_edge(4, 20.0), (2, 3, 1)).astype(float)
+    for name, light in (("sharp", sharp), ("blunt", gaussian_filter(sharp, (1, 1, 0)))):
+        Image.fromarray(np.uint8(np.rint(levels_of(light)))).save(tmp_path / f"{name}.png")
+    names = [tmp_path / f"{name}.png" for name in ("sharp", "blunt")]
+    words = ("compare", *names, "-o", tmp_path / "figure.png", "--crop", "0,0,64x48")
+    found = json.loads(run_cli(*words, "--json").stdout)["looks"]
+    for look, sigma in zip(found, (0, 1), strict=True):
+        assert look["mtf50"] == pytest.approx(frequency_at(0.5, pixel_mtf(20.0, sigma)), rel=0.05)
+        assert look["level"] == pytest.approx(np.median(levels_of(sharp)), abs=30)
+    printed = run_cli(*words).stdout
+    assert "MTF50  overshoot  level" in printed

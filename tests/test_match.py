@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
+from scipy.ndimage import gaussian_filter
 
 from clpipe.analysis.colours import saturated_of
 from clpipe.analysis.matching import match, search
@@ -44,6 +45,7 @@ from clpipe.analysis.matching.space import (
     space_for,
     variants_of,
 )
+from clpipe.analysis.quality.charts import checker, slanted_edge
 from clpipe.analysis.signature import DARK, flat_mask
 from clpipe.chain.files import load_config, load_settings
 from clpipe.chain.making import make_chain
@@ -52,6 +54,7 @@ from clpipe.commands.match import SearchProgress
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding, jpeg_round_trip
 from clpipe.pipeline import Pipeline
 from clpipe.reference.colour import luma
+from clpipe.reference.transfer import srgb_curve
 from tests.conftest import ROOT, run_cli
 
 SIZE, FRAMES = 128, 6
@@ -250,6 +253,33 @@ def test_crops_that_were_not_searched_prove_it(found):
 
 
 @pytest.mark.usefixtures("quick", "ambiguous")
+def test_charts_set_sharpness_and_tone(burst, tmp_path):
+    greys = np.full((512, 768, 3), 46.0)
+    levels = (245, 205, 160, 110, 70, 35)  # of a steep curve
+    chart = 255 * srgb_curve(checker())
+    chart[18:] = np.array(levels)[:, None]
+    for number, colour in enumerate(chart):
+        y, x = (128 * index for index in divmod(number, 6))
+        greys[y + 8 : y + 120, x + 8 : x + 120] = colour
+    blunt = gaussian_filter(slanted_edge(4, 5.0, 160).astype(float), (1.4, 1.4, 0))
+    pictures = {"checker": greys, "edge": 255 * srgb_curve(blunt)}
+    (tmp_path / "charts").mkdir()
+    eight_bits = {name: np.uint8(np.rint(each)) for name, each in pictures.items()}
+    files = saved(tmp_path / "charts", **eight_bits)
+    charts = [word for file in files for word in ("--chart", file)]
+    report = matched(burst[:3], tmp_path, "--iso", 3200, *charts)
+    assert np.abs(np.subtract(report["tone"]["ours"], report["tone"]["theirs"])).max() < 8
+    assert np.round(report["tone"]["theirs"]).tolist() == list(levels)
+    theirs, ours = (report["sharpness"][of]["mtf50"] for of in ("theirs", "ours"))
+    assert ours == pytest.approx(theirs, abs=0.01)
+    assert theirs < 0.2
+    assert not any(name.startswith("tone_curve") for name in report["searched"])
+    table = load_settings(str(tmp_path / "look.toml")).parameters
+    assert table["tone_curve"]["toe"] > 0.8 or table["tone_curve"]["shoulder"] > 0.75
+    assert table["optical_blur"]["sigma"] > 1
+
+
+@pytest.mark.usefixtures("quick", "ambiguous")
 def test_the_configuration_develops_what_was_measured(burst, tmp_path):
     report = matched(burst[:3], tmp_path, "--iso", 3200)
     assert report["ambiguities"] == [{"names": ["iso"], "correlation": None}]
@@ -365,7 +395,11 @@ def test_a_terminal_has_a_bar_with_the_share_and_the_time_left(burst, tmp_path):
 @pytest.fixture
 def quick(monkeypatch):
     """A search of one step in the small space."""
-    monkeypatch.setattr(match, "space_for", lambda *_: replace(SMALL, strength=None))
+
+    def space(settings, _):
+        return replace(SMALL, strength=None, is_toned=space_for(settings, True).is_toned)
+
+    monkeypatch.setattr(match, "space_for", space)
     monkeypatch.setattr(search, "TRIAL_STEPS", 1)
     monkeypatch.setattr(search, "FINAL_STEPS", 1)
 

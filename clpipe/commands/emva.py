@@ -6,12 +6,10 @@ import click
 
 from clpipe.analysis.emva.series import MIN_EXPOSURES, SIDES
 from clpipe.analysis.emva.simulation import SeriesSize, simulate
-from clpipe.base.errors import RequestError
 from clpipe.base.extras import require
-from clpipe.base.text import whole_number
 from clpipe.chain.keys import KEYS
 from clpipe.commands.chain_options import device_option, option
-from clpipe.commands.options import Command, json_option, output_option
+from clpipe.commands.options import Command, Sides, json_option, output_option
 from clpipe.commands.printing import show_json
 from clpipe.commands.progress import status_line
 from clpipe.engine.device import open_device
@@ -27,6 +25,7 @@ DEFAULT = SeriesSize()
     "--size",
     default=f"{DEFAULT.width}x{DEFAULT.height}",
     show_default=True,
+    type=Sides(*SIDES),
     metavar="WxH",
     help="The size of a frame in px.",
 )
@@ -52,7 +51,7 @@ def emva(
     camera: str,
     iso: float | None,
     output: Path,
-    size: str,
+    size: tuple[int, int],
     exposures: int,
     stack: int,
     seed: int,
@@ -73,14 +72,7 @@ def emva(
     clpipe calibrate --emva series/EMVA1288_Data.txt -o again.toml
     """
     require("clpipe emva", "calibrate", "scipy")
-    columns, rows = map(whole_number, size.partition("x")[::2])
-    least, most = SIDES
-    if not least <= min(columns, rows) <= max(columns, rows) <= most:
-        raise RequestError(
-            f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 640x480, "
-            f"with each side from {least} to {most} px"
-        )
-    series_size = SeriesSize(columns, rows, exposures, stack)
+    series_size = SeriesSize(*size, exposures, stack)
     with status_line() as show:
         series = simulate(
             camera,

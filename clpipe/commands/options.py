@@ -16,6 +16,7 @@ from click.core import ParameterSource
 
 from clpipe.base.errors import MissingError, RequestError
 from clpipe.base.reading import check_input
+from clpipe.base.text import whole_number
 from clpipe.base.url_text import is_url, local, local_path
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -170,6 +171,32 @@ class ExistingPath(click.Path):
 
 
 EXISTING = ExistingPath(path_type=Path)
+
+
+class Sides(click.ParamType[tuple[int, int]]):
+    """The width and height of a picture, as WIDTHxHEIGHT in px.
+
+    Args:
+        least: the shortest side, px.
+        most: the longest side, px.
+    """
+
+    name = "text"
+
+    def __init__(self, least: int, most: int) -> None:
+        self._limits = least, most
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        least, most = self._limits
+        width, height = map(whole_number, str(value).partition("x")[::2])
+        if not least <= min(width, height) <= max(width, height) <= most:
+            raise RequestError(
+                f"--size: found {value!r}; expected WIDTHxHEIGHT, such as 640x480, with each side "
+                f"from {least} to {most} px"
+            )
+        return width, height
 
 
 class OutputPath(click.Path):

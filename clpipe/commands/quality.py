@@ -13,7 +13,6 @@ from clpipe.analysis.quality.report import Quality, table
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import check_suffix, write_new
-from clpipe.base.text import whole_number
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, overlay
@@ -24,14 +23,12 @@ from clpipe.commands.chain_options import (
     set_option,
     settings_in,
 )
-from clpipe.commands.options import EXISTING, Command, json_option, output_option
+from clpipe.commands.options import EXISTING, Command, Sides, json_option, output_option
 from clpipe.commands.printing import show, show_json
 from clpipe.commands.progress import status_line
 from clpipe.engine.device import open_device
 from clpipe.engine.service import Service
 from clpipe.inputs.series import split_series
-
-SMALLEST, LARGEST = 480, 4096  # px of a side of the picture
 
 
 @click.command("quality", cls=Command)
@@ -50,6 +47,7 @@ SMALLEST, LARGEST = 480, 4096  # px of a side of the picture
     "--size",
     default="960x640",
     show_default=True,
+    type=Sides(480, 4096),
     metavar="WxH",
     help="The size of a simulated picture in px, for the figures of the lens.",
 )
@@ -59,7 +57,7 @@ SMALLEST, LARGEST = 480, 4096  # px of a side of the picture
 def quality(
     pictures: tuple[Path, ...],
     areas: tuple[str, ...],
-    size: str,
+    size: tuple[int, int],
     output: Path | None,
     selector: str | None,
     as_json: bool,
@@ -86,7 +84,6 @@ def quality(
         require("clpipe quality -o", "report")
     if output is not None:
         check_suffix("-o", output, ".html")
-    width, height = sides_of(size)
     if areas and not pictures:
         raise RequestError("--roi: this option is for pictures of real charts; name a PICTURE")
     chains = list(chains_of(options)) if not pictures or any(options.values()) else []
@@ -103,25 +100,10 @@ def quality(
         for settings in chains:
             show_status(settings.label)
             assert service is not None
-            reports.append(chain_quality(settings.label, settings, service, width, height))
+            reports.append(chain_quality(settings.label, settings, service, *size))
     if reports:
         write(reports, output, as_json)
     sys.exit(1 if failures else 0)
-
-
-def sides_of(size: str) -> tuple[int, int]:
-    """Return the width and height of a picture.
-
-    Raises:
-        RequestError: the text has another form, or a side is too short or long.
-    """
-    width, height = map(whole_number, size.partition("x")[::2])
-    if not SMALLEST <= min(width, height) <= max(width, height) <= LARGEST:
-        raise RequestError(
-            f"--size: found {size!r}; expected WIDTHxHEIGHT, such as 960x640, with each side from "
-            f"{SMALLEST} to {LARGEST} px"
-        )
-    return width, height
 
 
 def chains_of(options: dict[str, Any]) -> Iterator[Settings]:

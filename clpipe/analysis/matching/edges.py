@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 from clpipe.analysis.matching.scenes import Scene
 from clpipe.analysis.quality.charts import slanted_edge
-from clpipe.analysis.sharpness import Edge, edges_in, median_edge, sharpest
+from clpipe.analysis.quality.measure import light_of
+from clpipe.analysis.sharpness import Edge, edge_of, edges_in, median_edge, sharpest
 from clpipe.base.types import Array
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings, overlay
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Runner
 
-CONTRAST, ANGLES = 4.0, (5.0, 20.0, 70.0, 85.0)  # of the edges that are developed
+CONTRAST, ANGLES, SIDE = 4.0, (5.0, 20.0, 70.0, 85.0), 120  # of the edges that are developed
 SIGMAS, LIMITS = (0.1, 3.0), (0.0, 0.2)  # of optical_blur.sigma and sharpen.limit
 ROUNDS, STEPS = 3, 8  # of the search, and of each bisection
 
@@ -43,23 +44,30 @@ def as_sharp(
     """Return settings with edges as sharp as a camera's, and the figures of both.
 
     The settings do not change, and there are no figures, without an edge of the camera, or if the
-    chain lacks ``optical_blur`` or ``sharpen``.
+    chain has no blur of a lens. Without the unsharp mask, only the blur is fitted.
 
     Args:
         settings: of the development.
         theirs: of the camera, see :func:`edge_in`.
         device: the device that develops edges; None is NumPy.
     """
-    if theirs is None or not {"optical_blur", "sharpen"} <= set(settings.step_names):
+    numbers = {
+        name: number
+        for name, number in (("optical_blur", "sigma"), ("sharpen", "limit"))
+        if name in settings.step_names and hasattr(settings.method(name), number)
+    }
+    if theirs is None or "optical_blur" not in numbers:
         return settings, None
-    renders = [slanted_edge(CONTRAST, angle) for angle in ANGLES]
+    renders = [slanted_edge(CONTRAST, angle, SIDE) for angle in ANGLES]
 
     def over(sigma: float, limit: float) -> Settings:
-        return overlay(settings, {"optical_blur": {"sigma": sigma}, "sharpen": {"limit": limit}})
+        values = {"optical_blur": {"sigma": sigma}, "sharpen": {"limit": limit}}
+        return overlay(settings, {name: values[name] for name in numbers})
 
     def ours(sigma: float, limit: float) -> Edge:
         runner = Runner(make_chain(over(sigma, limit)).without_noise(), device)
-        return median_edge([e for render in renders for e in edges_in(picture(runner, render))])
+        developed = (edge_of(light_of(picture(runner, render))) for render in renders)
+        return median_edge([edge for edge in developed if edge])
 
     def too_much(limit: float, sigma: float) -> bool:
         return ours(sigma, limit).overshoot > theirs.overshoot
@@ -69,7 +77,7 @@ def as_sharp(
 
     sigma = 0.65
     for _ in range(ROUNDS):
-        limit = _solved(too_much, *LIMITS, sigma)
+        limit = _solved(too_much, *LIMITS, sigma) if "sharpen" in numbers else 0.0
         sigma = _solved(too_blunt, *SIGMAS, limit)
     found = round(sigma, 3), round(limit, 4)
     return over(*found), Sharpness(theirs, ours(*found))

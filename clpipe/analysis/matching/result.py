@@ -24,8 +24,7 @@ from clpipe.chain.toml import value_text
 AT_END = 0.01  # share of the range; an ISO this close to an end counts as at the end
 NO_EDGES = (
     "the pictures have too few straight, isolated edges to measure their sharpness, so "
-    "optical_blur and sharpen.limit are the defaults; add pictures of objects with straight edges, "
-    "or a picture of a slanted edge (--chart)"
+    "optical_blur and sharpen.limit are the defaults; add a picture of a slanted edge (--chart)"
 )
 CHECKED = 4  # frames of each pair that are developed to measure the result
 

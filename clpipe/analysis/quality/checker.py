@@ -15,7 +15,7 @@ SEEN = 480  # px of the longer side of the picture in which patches are sought
 ROWS, COLUMNS = 4, 6
 FOUND = 10  # patches of 24 that must be found; the places of the others follow from them
 STEEP = 6.0  # levels per px, above which a pixel is at the border of a patch
-AREA = (25, 0.03)  # of a patch: the least in px, and the largest share of the picture
+AREA = (25, 0.045)  # of a patch: the least in px, and the largest share of the picture
 MOST_ERROR = 30.0  # mean difference of a* and b* of a chart that is taken for a ColorChecker
 SHARE = 0.4  # of the distance of patches, that is measured
 

@@ -14,8 +14,8 @@ BLOCKS = 16  # of a flat field along its longer side
 def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
     """Return the dots of a picture, or None if there is no grid of dots.
 
-    They are the row and column of each dot from the central one, (dot, 2), and the centres of its
-    red, green and blue, (dot, 3, 2): y and x in px from the centre of the picture.
+    The first array has the row and column of each dot from the central one, (dot, 2). The second
+    has the centres of its red, green and blue, (dot, 3, 2): y and x in px from the picture's centre.
 
     Args:
         light: linear RGB, (height, width, 3), of dark dots on white.

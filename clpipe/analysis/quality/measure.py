@@ -4,21 +4,9 @@ from dataclasses import asdict
 
 import numpy as np
 
-from clpipe.analysis.quality import lens
-from clpipe.analysis.quality.charts import (
-    CHECKER,
-    GREY,
-    checker,
-    chroma_edge,
-    dead_leaves,
-    dots,
-    glare_spot,
-    grey,
-    grey_steps,
-    patch_image,
-    patches_of,
-    slanted_edge,
-)
+from clpipe.analysis import sharpness
+from clpipe.analysis.quality import charts, lens
+from clpipe.analysis.quality.charts import CHECKER, GREY, patch_image, patches_of, slanted_edge
 from clpipe.analysis.quality.colour import checker_errors
 from clpipe.analysis.quality.greys import GreyPatches
 from clpipe.analysis.quality.report import CONTRASTS, MAIN, Curve, Quality, edge_figure
@@ -26,7 +14,6 @@ from clpipe.analysis.quality.simulation import ChartCamera
 from clpipe.analysis.quality.texture import texture_mtf
 from clpipe.analysis.quality.visual_noise import acutance
 from clpipe.analysis.sharpness import (
-    CURVES,
     FREQUENCIES,
     Edge,
     edge_of,
@@ -95,7 +82,7 @@ def light_of(levels: Array) -> Doubles:
 
 def developed_greys(camera: ChartCamera) -> GreyPatches:
     """Return pictures of the grey patches."""
-    light = grey_steps()
+    light = charts.grey_steps()
     frames = camera.frames(patch_image(light[:, None].repeat(3, 1)), "greys", FRAMES["greys"])
     return GreyPatches(light, patches_of(frames.astype(np.float64)))
 
@@ -135,7 +122,7 @@ def edge_found(edge: Edge, contrast: float) -> Found:
     }
     figures = {edge_figure(key, contrast): value for key, value in values.items()}
     if contrast == MAIN:
-        channels = zip(CURVES[1:], edge.mtf[1:], strict=True)
+        channels = zip(sharpness.CURVES[1:], edge.mtf[1:], strict=True)
         figures |= {f"mtf50_{name}": frequency_at(0.5, mtf) for name, mtf in channels}
         figures |= {"edge_red": edge.red, "edge_blue": edge.blue, "capacity": edge.capacity}
     return figures, {(SFR, f"{contrast:g}:1"): Curve(FREQUENCIES[SHOWN], edge.mtf[0][SHOWN])}
@@ -143,7 +130,7 @@ def edge_found(edge: Edge, contrast: float) -> Found:
 
 def _texture(camera: ChartCamera) -> Found:
     """Return the figures and curve of a texture; NaN if the picture has another size."""
-    chart = dead_leaves()
+    chart = charts.dead_leaves()
     [picture] = camera.frames(chart, "texture")
     if picture.shape != chart.shape:
         return {"texture_mtf50": np.nan, "acutance": np.nan}, {}
@@ -199,7 +186,7 @@ def _colours(camera: ChartCamera) -> Found:
     true = np.array(CHECKER, np.float64)
     errors = []
     for under_a in (False, True):
-        frames = camera.frames(patch_image(checker(under_a)), f"colours {under_a}")
+        frames = camera.frames(patch_image(charts.checker(under_a)), f"colours {under_a}")
         errors.append(asdict(checker_errors(patches_of(frames).mean((1, 2, 3)), true)))
     by_day, by_lamp = errors
     figures = {key: value for key, value in by_day.items() if key != "grey_level"}
@@ -208,7 +195,7 @@ def _colours(camera: ChartCamera) -> Found:
 
 def _chroma_edge(camera: ChartCamera) -> float:
     """Return the distance over which chroma rises from 10 to 90 % at an edge of even luma, px."""
-    frames = camera.frames(chroma_edge(EDGE), "chroma edge", FRAMES["edge"], jpeg=True)
+    frames = camera.frames(charts.chroma_edge(EDGE), "chroma edge", FRAMES["edge"], jpeg=True)
     rows = frames.mean((0, 1)) @ BLUE_DIFFERENCE
     side = len(rows)  # a chain may resize the picture
     ends = rows[: side // 4].mean(), rows[-side // 4 :].mean()
@@ -231,7 +218,11 @@ def lens_figures(
         height: of the picture.
     """
     flat = np.full((height, width), GREY)
-    renders = {"flat": grey(flat), "dots": dots(width, height), "glare": glare_spot(width, height)}
+    renders = {
+        "flat": charts.grey(flat),
+        "dots": charts.dots(width, height),
+        "glare": charts.glare_spot(width, height),
+    }
     field, dotted, spot = (
         camera.frames(render, name, FRAMES["lens"], whole=True).mean(0)
         for name, render in renders.items()

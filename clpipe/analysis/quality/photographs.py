@@ -75,9 +75,8 @@ def picture_quality(path: Path, areas: Sequence[str] = ()) -> Quality:
         edges += [edge] if edge else []
         if not edge and not found:
             raise RequestError(
-                f"{path}: --roi {crop.box}: neither one straight edge, a ColorChecker, a grid of "
-                "dots nor a flat field is in this area; choose one with 40 px to both sides of an "
-                "edge"
+                f"{path}: --roi {crop.box}: this area has no edge, ColorChecker, grid of dots or "
+                "flat field; choose one with 40 px to both sides of a straight edge"
             )
         parts |= found
     if edges:

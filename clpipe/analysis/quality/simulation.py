@@ -15,6 +15,7 @@ from clpipe.images.jpeg import JpegEncoding, jpeg_round_trip
 from clpipe.stage import Kind
 
 SAME = RunOptions(unchanged=True)  # all frames have one render, which is uploaded once
+
 # Stages that need a scene with motion, depth or surroundings, and those that act by the place in
 # the picture or by the rest of it, which charts in its centre do not show.
 SCENE = ("projection", "shutter", "defocus")

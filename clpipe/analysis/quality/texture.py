@@ -13,9 +13,9 @@ EXPONENT, REFERENCE = 1.857, 0.04  # of the power spectrum of dead leaves; cycle
 def texture_mtf(pictured: Doubles, chart: Doubles) -> Doubles:
     """Return the MTF of a texture at :data:`~clpipe.analysis.sharpness.FREQUENCIES` up to 0.5.
 
-    It is the cross power spectrum of picture and chart over the power spectrum of the chart (Kirk,
-    Herzer, Artmann and Kunz, "Description of texture loss using the dead leaves target: current
-    issues and a new intrinsic approach", 2014). Noise is not part of it, but invented detail is
+    It is the cross power spectrum of picture and chart over the power spectrum of the chart. The
+    source is Kirk, Herzer, Artmann and Kunz, "Description of texture loss using the dead leaves
+    target: current issues and a new intrinsic approach" (2014). Noise is not part of it, but invented detail is
     not, either. The MTF of the chart's square pixel is included.
 
     Args:
@@ -45,9 +45,9 @@ def texture_mtf(pictured: Doubles, chart: Doubles) -> Doubles:
 def printed_texture_mtf(pictured: Doubles, grey: Doubles | None = None) -> Doubles:
     """Return the MTF of a texture of which only the power spectrum is known, as above.
 
-    It is the root of the picture's power over f^-1.857, the spectrum of dead leaves (McElvain,
-    Campbell, Miller and Jin, "Texture-based measurement of spatial frequency response using the
-    dead leaves target", 2010), and 1 at 0.04 cycles/px. Detail that sharpening or noise adds counts
+    It is the root of the picture's power over f^-1.857, the spectrum of dead leaves, and is 1 at
+    0.04 cycles/px. The source is McElvain, Campbell, Miller and Jin, "Texture-based measurement of
+    spatial frequency response using the dead leaves target" (2010). Detail that sharpening or noise adds counts
     as texture, unless ``grey`` shows its power.
 
     Args:

@@ -9,6 +9,7 @@ from clpipe.reference.transfer import inverse_srgb_curve
 PIXELS_PER_DEGREE = 41.2  # a screen of 100 pixels per inch, seen at full size from 60 cm
 OPPONENT = np.array([[0, 1, 0], [1, -1, 0], [0, 0.4, -0.4]])  # from XYZ under E to A, C1, C2
 WEIGHTS = 1.0, 0.852, 0.323  # of the noise of L*, u* and v*
+
 # a1, b1, c1, a2, b2, c2 of the sensitivity to C1 and C2: a1 exp(-b1 f^c1) + a2 exp(-b2 f^c2)
 CHROMATIC = (
     (109.1413, 0.00038, 3.42436, 93.59711, 0.00367, 2.16771),
