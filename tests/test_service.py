@@ -113,12 +113,12 @@ def test_another_device_takes_over(device, caplog):
             is_broken.set()
             return super().submit(works)
 
-    class Second(Device):
-        def submit(self, works):
-            assert is_broken.wait(GUARD)
-            return super().submit(works)
+    devices = First(device.info), Device(device.info)
 
-    service, ordered = Service([First(device.info), Second(device.info)]), frames()
+    def prepare(each):  # the second device takes no frame before the first one is broken
+        assert each is devices[0] or is_broken.wait(GUARD)
+
+    service, ordered = Service(devices, prepare), frames()
     for frame in ordered * 2:
         (development,) = service.develop([frame])
         same(development.result(GUARD), alone(frame, device))

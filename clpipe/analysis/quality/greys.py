@@ -62,7 +62,7 @@ class GreyPatches:
         return np.gradient(np.log(np.maximum(self.luma, 0.5)), np.log(self.light))
 
     def visual_noise(self) -> Doubles:
-        """Return the visual noise of each patch, see :func:`~clpipe.analysis.quality.visual_noise.visual_noise`."""
+        """Return the visual noise of each patch, see :func:`visual_noise`."""
         return np.array([visual_noise(each) for each in self.levels])
 
     def light_at(self, levels: Doubles) -> Doubles:

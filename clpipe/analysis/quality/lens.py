@@ -15,7 +15,7 @@ def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
     """Return the dots of a picture, or None if there is no grid of dots.
 
     The first array has the row and column of each dot from the central one, (dot, 2). The second
-    has the centres of its red, green and blue, (dot, 3, 2): y and x in px from the picture's centre.
+    has the centres of its red, green and blue, (dot, 3, 2): y and x, px from the middle.
 
     Args:
         light: linear RGB, (height, width, 3), of dark dots on white.

@@ -15,8 +15,8 @@ def texture_mtf(pictured: Doubles, chart: Doubles) -> Doubles:
 
     It is the cross power spectrum of picture and chart over the power spectrum of the chart. The
     source is Kirk, Herzer, Artmann and Kunz, "Description of texture loss using the dead leaves
-    target: current issues and a new intrinsic approach" (2014). Noise is not part of it, but invented detail is
-    not, either. The MTF of the chart's square pixel is included.
+    target: current issues and a new intrinsic approach" (2014). It excludes noise and invented
+    detail. The MTF of the chart's square pixel is included.
 
     Args:
         pictured: linear RGB, (side, side, 3).
@@ -47,8 +47,8 @@ def printed_texture_mtf(pictured: Doubles, grey: Doubles | None = None) -> Doubl
 
     It is the root of the picture's power over f^-1.857, the spectrum of dead leaves, and is 1 at
     0.04 cycles/px. The source is McElvain, Campbell, Miller and Jin, "Texture-based measurement of
-    spatial frequency response using the dead leaves target" (2010). Detail that sharpening or noise adds counts
-    as texture, unless ``grey`` shows its power.
+    spatial frequency response using the dead leaves target" (2010). Noise counts as texture, unless
+    ``grey`` shows its power. Detail that sharpening adds always counts.
 
     Args:
         pictured: linear RGB, (height, width, 3).
