@@ -16,9 +16,9 @@ from clpipe.stage import Kind
 
 SAME = RunOptions(unchanged=True)  # all frames have one render, which is uploaded once
 
-# Stages that need a scene with motion, depth or surroundings, and those that act by the place in
-# the picture or by the rest of it, which charts in its centre do not show.
+# Stages that need a scene with motion, depth or surroundings.
 SCENE = ("projection", "shutter", "defocus")
+# Stages that depend on the place in the picture, or on the rest of it.
 PLACE = ("distortion", "vignetting", "glare")
 
 
