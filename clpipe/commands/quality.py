@@ -14,10 +14,12 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.extras import require
 from clpipe.base.files import check_suffix, write_new
 from clpipe.chain.isos import check_cameras
+from clpipe.chain.options import OPTIONS
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings, overlay
 from clpipe.commands.chain_options import (
     SETTINGS,
+    described,
     device_option,
     options,
     set_option,
@@ -30,10 +32,19 @@ from clpipe.engine.device import open_device
 from clpipe.engine.service import Service
 from clpipe.inputs.series import split_series
 
+CAMERAS = OPTIONS["camera"]._replace(
+    text="A built-in camera, by name or model, or a profile (.toml). Each becomes a column.",
+    default_text=described(OPTIONS["camera"]).default_text,
+)
+ISOS = OPTIONS["iso"]._replace(
+    text="The ISO, or several. Each becomes a column.",
+    default_text=described(OPTIONS["iso"]).default_text,
+)
+
 
 @click.command("quality", cls=Command)
 @click.argument("pictures", nargs=-1, type=EXISTING, metavar="[PICTURE...]")
-@options("config", "camera", "iso", *SETTINGS)
+@options("config", CAMERAS, ISOS, *SETTINGS)
 @set_option
 @click.option(
     "--roi",
