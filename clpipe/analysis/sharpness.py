@@ -18,10 +18,13 @@ SIDE = 28  # px, of the windows in which edges are sought
 STEP = 7  # px between windows
 MOST_WINDOWS = 50_000  # in large pictures, fewer are tried
 REACH = 9  # px of the profile to each side of an edge that is sought
-WIDE = 20  # px, of an edge that fills its picture
+WIDE = (20, 40, 80)  # px, of an edge that fills its picture: wider if it is blurred
+NARROW = 4  # rises of an edge that its profile must have to each side
+MAX_EMPTY = 0.2  # share of distances that no pixel has: the edge has a slope such as 1:2
 FLAT = 3  # px at each end of the profile that belong to the plateaus
 BINS = 4  # of the profile in a pixel
-MIN_CONTRAST = 0.03  # between the plateaus, in linear light
+MIN_CONTRAST = 0.03  # between the plateaus, in linear light, of an edge that is sought
+DARKEST_CONTRAST = 1e-3  # of an edge that fills its picture
 MAX_BEND = 0.35  # px; rms distance of an edge's points from its line
 MAX_UNEVENNESS = 0.15  # rms of a plateau over the contrast
 MIN_EDGES = 12
@@ -103,15 +106,28 @@ def edge_of(light: Doubles) -> Edge | None:
     Args:
         light: linear RGB, (height, width, 3). It should have 40 px to both sides of the edge.
     """
-    smooth = light @ LUMINANCE
+    luma = light @ LUMINANCE
+    smooth = luma
     for _ in range(2 * SMOOTHINGS):  # along each axis, against noise
         wide = np.pad(smooth, ((1, 1), (0, 0)), "edge")
         smooth = ((wide[:-2] + 2 * wide[1:-1] + wide[2:]) / 4).T
     distance = _distance(np.stack(np.gradient(smooth)), fills=True)
     if distance is None:
         return None
-    reach = int(min(WIDE, *np.abs(np.percentile(distance, [3, 97]))))
-    return _edge(light, distance, reach, False) if reach > 2 * FLAT else None
+    room = int(np.abs(np.percentile(distance, [3, 97])).min())
+    edge = None
+    for reach in sorted({min(each, room) for each in WIDE if room > 2 * FLAT}):
+        edge, profile = _edge(light, distance, reach, False), _profile(distance, luma, reach)
+        if edge is None or profile is None or NARROW * _rise(profile) < reach:
+            break
+    return edge
+
+
+def _rise(profile: Doubles) -> float:
+    """Return the distance in which a profile rises from 10 to 90 %, px."""
+    ends = profile[: FLAT * BINS].mean(), profile[-FLAT * BINS :].mean()
+    levels = np.maximum.accumulate((profile - ends[0]) / (ends[1] - ends[0]))
+    return float(np.diff(np.searchsorted(levels, [0.1, 0.9]))[0] / BINS)
 
 
 def sharpest(edges: Sequence[Edge]) -> Edge | None:
@@ -156,7 +172,8 @@ def _edge(light: Doubles, distance: Doubles, reach: int, strict: bool) -> Edge |
     spans = [[p[end] for end in ends] for p in profiles]
     contrasts = [bright.mean() - dark.mean() for dark, bright in spans]
     contrast, uneven = contrasts[0], max(each.std() for each in spans[0])
-    if min(contrasts[1:]) < MIN_CONTRAST / 2 or contrast < MIN_CONTRAST:
+    least = MIN_CONTRAST if strict else DARKEST_CONTRAST
+    if min(contrasts[1:]) < least / 2 or contrast < least:
         return None
     if strict and uneven > MAX_UNEVENNESS * contrast:
         return None
@@ -168,21 +185,24 @@ def _edge(light: Doubles, distance: Doubles, reach: int, strict: bool) -> Edge |
     mtf50 = frequency_at(0.5, mtf[0])
     if np.isnan(mtf50):
         return None
-    near = scaled[0][FLAT * BINS : -FLAT * BINS].reshape(-1, BINS // 2).mean(1)
+    halves = scaled[0].reshape(-1, BINS // 2).mean(1)
+    plateau, near = FLAT * 2, halves[FLAT * 2 : -FLAT * 2]
+    # The largest of many values exceeds the plateau by about two sigmas of their noise.
+    noise = 0.0 if strict else 2 * max(halves[:plateau].std(), halves[-plateau:].std())
     red, green, blue = (_centre(profile, reach) for profile in scaled[1:])
     plateaus = (abs(distance) > reach - FLAT) & (abs(distance) < reach + 2 * FLAT)
     smooth = np.interp(distance, (np.arange(2 * reach * BINS) + 0.5) / BINS - reach, profiles[0])
-    noise = np.where(plateaus, luma - smooth, 0.0)
+    grain = np.where(plateaus, luma - smooth, 0.0)
     return Edge(
         mtf50,
         frequency_at(0.1, mtf[0]),
         float(mtf[0, len(FREQUENCIES) // 2]),
-        max(float(near.max()) - 1, 0.0),
-        max(float(-near.min()), 0.0),
+        max(float(near.max()) - 1 - noise, 0.0),
+        max(float(-near.min()) - noise, 0.0),
         red - green,
         blue - green,
         float(contrast),
-        _capacity(contrast, mtf[0], noise, int(plateaus.sum())),
+        _capacity(contrast, mtf[0], grain, int(plateaus.sum())),
         mtf,
     )
 
@@ -242,7 +262,9 @@ def _distance(slopes: Doubles, fills: bool = False) -> Doubles | None:
         return None
     distance = (distance - line(place)) / np.hypot(1, line.deriv()(place))
     length = abs(place[abs(distance) < 1]).max(initial=0)
-    return distance if length >= min(down.shape) / 4 else None
+    counts = np.histogram(distance, np.arange(-30, 31) / 10)[0]
+    uneven = fills and (counts < 0.25 * counts.mean()).mean() > MAX_EMPTY
+    return distance if length >= min(down.shape) / 4 and not uneven else None
 
 
 def _line(

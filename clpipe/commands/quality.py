@@ -97,13 +97,15 @@ def quality(
         check_suffix("-o", output, ".html")
     if areas and not pictures:
         raise RequestError("--roi: this option is for pictures of real charts; name a PICTURE")
-    chains = list(chains_of(options)) if not pictures or any(options.values()) else []
+    is_chosen = any(value not in (None, (), False) for value in options.values())
+    chains = list(chains_of(options)) if is_chosen or not pictures else []
+    names = distinct_paths(pictures)
     reports, failures = [], 0
     with status_line() as show_status:
-        for path in pictures:
-            show_status(path.name)
+        for path, name in zip(pictures, names, strict=True):
+            show_status(name)
             try:
-                reports.append(picture_quality(path, areas))
+                reports.append(picture_quality(path, areas, name))
             except ImageError as error:
                 failures += 1
                 click.echo(f"clpipe: {error}", err=True)
@@ -115,6 +117,12 @@ def quality(
     if reports:
         write(reports, output, as_json)
     sys.exit(1 if failures else 0)
+
+
+def distinct_paths(pictures: tuple[Path, ...]) -> list[str]:
+    """Return the names of files, or their paths if names repeat."""
+    names = [path.name for path in pictures]
+    return names if len(set(names)) == len(names) else list(map(str, pictures))
 
 
 def chains_of(options: dict[str, Any]) -> Iterator[Settings]:
@@ -154,5 +162,7 @@ def write(reports: list[Quality], output: Path | None, as_json: bool) -> None:
     for report in reports:
         if report.found:
             click.echo(f"{report.name}: found {', '.join(report.found)}")
+        for warning in report.warnings:
+            click.echo(f"{report.name}: warning: {warning}")
     if output is not None:
         click.echo(f"wrote {output}")

@@ -18,7 +18,7 @@ def quality_html(reports: Sequence[Quality]) -> str:
         .render(
             version=__version__,
             names=[report.name for report in reports],
-            found={report.name: ", ".join(report.found) for report in reports if report.found},
+            found=[(report.name, ", ".join(report.found)) for report in reports if report.found],
             sections=sections,
             drawings=quality_svgs(reports),
             style=page_text("css"),

@@ -54,7 +54,7 @@ def read_charts(paths: Sequence[Path]) -> Charts:
     edges: list[Edge] = []
     greys = None
     for path in paths:
-        levels = read_levels(path)
+        levels, _ = read_levels(path)
         whole = edge_of(light_of(levels))
         patches = None if whole else find_checker(levels)
         found = whole or sharpest(edges_in(levels))

@@ -13,7 +13,8 @@ from clpipe.reference.transfer import inverse_srgb_curve
 
 GREY = 0.18  # the linear level of a middle grey
 SIDE, BORDER, ROW = 128, 8, 6  # px of a patch, and of background around it; patches in a row
-STOPS = np.arange(-21, 9) / 2  # EV of the grey patches, from a middle grey
+# EV of the grey patches, from a middle grey: in steps of 0.5, and finer where highlights clip.
+STOPS = np.concatenate([np.arange(-21, 0) / 2, np.arange(44) / 10])
 SMALLEST = 0.6  # px, the radius of the smallest of the dead leaves
 PITCH, DOT = 48, 8.0  # px between the dots of the chart of dots, and their radius
 
@@ -114,8 +115,8 @@ def patches_of(frames: Array) -> Array:
 
 
 def grey_steps() -> Doubles:
-    """Return the linear levels of 30 grey patches, from -10.5 to 4 EV of a middle grey."""
-    return GREY * 2**STOPS
+    """Return the linear levels of 66 grey patches: black, and -10.5 to 4.3 EV of a middle grey."""
+    return np.concatenate([[0], GREY * 2**STOPS])
 
 
 def checker(under_a: bool = False) -> Doubles:

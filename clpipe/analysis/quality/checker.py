@@ -5,18 +5,19 @@ from itertools import product
 
 import numpy as np
 
-from clpipe.analysis.quality.charts import CHECKER
-from clpipe.analysis.quality.colour import cielab
+from clpipe.analysis.quality.charts import CHECKER, GREYS
+from clpipe.analysis.quality.colour import lab_of
 from clpipe.analysis.quality.grids import numbered
 from clpipe.base.types import Array, Doubles
 from clpipe.reference.image import in_blocks
+from clpipe.reference.transfer import inverse_srgb_curve
 
 SEEN = 480  # px of the longer side of the picture in which patches are sought
 ROWS, COLUMNS = 4, 6
 FOUND = 10  # patches of 24 that must be found; the places of the others follow from them
 STEEP = 6.0  # levels per px, above which a pixel is at the border of a patch
 AREA = (25, 0.045)  # of a patch: the least in px, and the largest share of the picture
-MOST_ERROR = 30.0  # mean difference of a* and b* of a chart that is taken for a ColorChecker
+MOST_ERROR = 20.0  # mean difference of a* and b* of a chart that is taken for a ColorChecker
 SHARE = 0.4  # of the distance of patches, that is measured
 
 
@@ -116,6 +117,7 @@ def _patches(picture: Array, centres: Doubles) -> Doubles | None:
 
 
 def _error(patches: Doubles) -> float:
-    """Return the mean difference of a* and b* from those of a ColorChecker."""
-    found, true = cielab(patches.mean((1, 2))), cielab(np.array(CHECKER))
-    return float(np.hypot(*(found - true)[:, 1:].T).mean())
+    """Return the mean difference of a* and b* from a ColorChecker, after balancing its greys."""
+    found, true = (inverse_srgb_curve(np.asarray(p) / 255) for p in (patches.mean((1, 2)), CHECKER))
+    gains = true[GREYS].mean(0) / np.maximum(found[GREYS].mean(0), 1e-6)
+    return float(np.hypot(*(lab_of(found * gains) - lab_of(true))[:, 1:].T).mean())

@@ -10,8 +10,9 @@ from clpipe.base.types import Doubles
 
 LUMINANCE = np.array([0.2125, 0.7154, 0.0721])  # weights of ISO 15739, for display values
 CHROMA = 0.279, 0.088  # weights of the variances of R-Y and B-Y in its noise
+HALF, NEARLY = 0.69, 0.3  # sigmas and levels below the highest level at saturation
+ROUNDING = 12**-0.5  # the standard deviation of rounding to whole levels
 TOLERANCE = 0.5  # of a contrast that is detected
-ROUNDING = 12**-0.5  # levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +22,14 @@ class GreyPatches:
     Args:
         light: the luminance of each patch, 0.18 is a middle grey.
         levels: display values, (patch, frame, height, width, 3), 0 to 255.
+        black: the mean level of a black patch, (3,); None if there is none.
+        rounding: the standard deviation of the rounding of levels.
     """
 
     light: Doubles
     levels: Doubles
+    black: Doubles | None = None
+    rounding: float = 0.0
 
     @cached_property
     def means(self) -> Doubles:
@@ -46,15 +51,16 @@ class GreyPatches:
 
     @property
     def snr(self) -> Doubles:
-        """The signal-to-noise ratio of each patch, dB; NaN where the curve is flat.
+        """The signal-to-noise ratio of each patch, dB; NaN without noise or slope.
 
         It is 20 log10 of luminance times the curve's slope over the noise, which is at least that
-        of rounding to whole levels.
+        of rounding.
         """
         signal = self.light * np.gradient(self.luma, self.light)
         useful = (signal > 0) & ~(self.light >= self.saturation)
-        noise = np.maximum(self.sigma, ROUNDING)
-        return 20 * np.log10(np.where(useful, signal, np.nan) / noise)
+        noise = np.maximum(self.sigma, self.rounding)
+        useful &= noise > 1e-6
+        return 20 * np.log10(np.where(useful, signal, np.nan) / np.where(useful, noise, np.nan))
 
     @property
     def gamma(self) -> Doubles:
@@ -71,19 +77,25 @@ class GreyPatches:
         Args:
             levels: (..., 3), 0 to 255.
         """
-        rising = [
-            np.maximum.accumulate(self.means[:, c]) + 1e-9 * np.arange(len(self.light))
-            for c in range(3)
-        ]
-        planes = [np.interp(levels[..., c], rising[c], self.light) for c in range(3)]
+        light, means = self.light, self.means
+        if self.black is not None:
+            light, means = np.append(0, light), np.vstack([self.black, means])
+        rising = np.maximum.accumulate(means) + 1e-9 * np.arange(len(light))[:, None]
+        planes = [np.interp(levels[..., c], rising[:, c], light) for c in range(3)]
         return np.stack(planes, axis=-1)
 
     @property
     def saturation(self) -> float:
-        """The lowest luminance with the highest level, to half a level; NaN if no patch clips."""
-        if self.luma[-1] - self.luma[-2] > 1:
+        """The luminance at which the curve reaches its highest level; NaN if no patch clips.
+
+        Where noise makes half of the samples clip, their mean is 0.7 of the remaining sigma lower.
+        """
+        missing = self.luma[-1] - self.luma - HALF * self.sigma - NEARLY
+        below = np.flatnonzero(missing > 0)
+        if self.luma[-1] - self.luma[-2] > 1 or not len(below):
             return float("nan")
-        return float(np.interp(self.luma[-1] - 0.5, self.luma, self.light))
+        ends = below[-1] + np.arange(2)
+        return float(np.interp(0, -missing[ends], self.light[ends]))
 
     @property
     def dynamic_range(self) -> float:
@@ -102,21 +114,20 @@ class GreyPatches:
             start = np.interp(0.0, snr[[first - 1, first]], np.log2(self.light[[first - 1, first]]))
         return float(np.log2(self.saturation) - start)
 
-    def detection(self, step: int) -> tuple[Doubles, Doubles]:
-        """Return luminances, and the contrast detection probability there (Geese et al., EI 2018).
+    def detection(self) -> tuple[Doubles, Doubles]:
+        """Return luminances, and the probability that a contrast of 2:1 is detected there.
 
         It is the share of pairs of pixels, one of each of two patches, whose Michelson contrast in
-        luminance is within 50 % of that of the patches.
-
-        Args:
-            step: the number of patches between both.
+        luminance is within 50 % of that of the patches (Geese, Seger and Paolillo, "Detection
+        probabilities", EI 2018). There are no values without patches of this contrast.
         """
         seen = self.light_at(self.levels) @ LUMINANCE
-        pairs = []
-        rng = np.random.default_rng(0)
-        for dark, bright in zip(range(len(seen) - step), range(step, len(seen)), strict=True):
-            one, two = seen[dark].ravel(), rng.permutation(seen[bright].ravel())
-            true = (self.light[bright] - self.light[dark]) / (self.light[bright] + self.light[dark])
-            contrast = (two - one) / np.maximum(two + one, 1e-12)
-            pairs.append((np.abs(contrast / true - 1) <= TOLERANCE).mean())
-        return np.sqrt(self.light[:-step] * self.light[step:]), np.array(pairs)
+        at, shares, rng = [], [], np.random.default_rng(0)
+        for dark, light in enumerate(self.light):
+            bright = int(np.abs(self.light - 2 * light).argmin())
+            if abs(self.light[bright] / light - 2) < 0.02:
+                one, two = seen[dark].ravel(), rng.permutation(seen[bright].ravel())
+                contrast = (two - one) / np.maximum(two + one, 1e-12)
+                at.append(2**0.5 * light)
+                shares.append((np.abs(contrast * 3 - 1) <= TOLERANCE).mean())
+        return np.array(at), np.array(shares)

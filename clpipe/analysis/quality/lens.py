@@ -4,10 +4,12 @@ import numpy as np
 
 from clpipe.analysis.quality.grids import numbered
 from clpipe.base.types import Doubles
-from clpipe.reference.image import in_blocks
 
 DARK = 0.6  # of the local white, below which a pixel belongs to a dot
-MIN_DOTS = 25
+MIN_DOTS, MOST_DOTS = 25, 20_000
+SMALLEST = 20  # px, of the area of a dot
+ROUND = 0.12  # largest difference of a dot's area over that of its box from that of a circle
+IN_GRID = 0.7  # least share of the dots that form the grid
 BLOCKS = 16  # of a flat field along its longer side
 
 
@@ -25,9 +27,15 @@ def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
     green = light[..., 1]
     white = ndimage.percentile_filter(green[::4, ::4], 90, 25).repeat(4, 0).repeat(4, 1)
     labels, _ = ndimage.label(green < DARK * white[: green.shape[0], : green.shape[1]])
-    boxes = ndimage.find_objects(labels)
-    if len(boxes) < MIN_DOTS:
+    areas = np.bincount(labels.ravel())[1:]
+    if not MIN_DOTS <= (areas >= SMALLEST).sum() < MOST_DOTS:
         return None
+    boxes = [
+        box
+        for box, area in zip(ndimage.find_objects(labels), areas, strict=True)
+        if area >= SMALLEST
+    ]
+    areas = areas[areas >= SMALLEST]
     starts, stops = (
         np.array([[getattr(s, end) for s in b] for b in boxes]) for end in ("start", "stop")
     )
@@ -35,6 +43,7 @@ def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
     usual = np.median(sizes, axis=0)
     margin = int(usual.max() / 2) + 2
     whole = np.abs(sizes - usual) <= 0.35 * usual + 1
+    whole &= (np.abs(areas / sizes.prod(1) - np.pi / 4) < ROUND)[:, None]
     inside = (starts >= margin) & (stops + margin <= green.shape)
     found = [
         np.add(
@@ -47,7 +56,7 @@ def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
     if len(found) < MIN_DOTS:
         return None
     points = np.array(found) - margin - (np.array(green.shape) - 1) / 2
-    grid = numbered(points[:, 1], MIN_DOTS)
+    grid = numbered(points[:, 1], max(MIN_DOTS, round(IN_GRID * len(points))))
     return (grid[0], points[grid[1]]) if grid else None
 
 
@@ -100,23 +109,24 @@ def dot_figures(numbers: Doubles, places: Doubles) -> dict[str, float]:
 def shading(light: Doubles) -> dict[str, float]:
     """Return the shading of a flat field: light in the corners over that in the centre, in %.
 
-    ``color_shading`` is the largest difference of red or blue over green there, in %.
+    ``shading`` is the mean of the four corners, ``darkest_corner`` the lowest. ``color_shading`` is
+    the largest difference of red or blue over green there, in %.
 
     >>> shading(np.ones((64, 96, 3)))
-    {'shading': 100.0, 'color_shading': 0.0}
+    {'shading': 100.0, 'darkest_corner': 100.0, 'color_shading': 0.0}
 
     Args:
         light: linear RGB, (height, width, 3).
     """
-    block = max(light.shape[:2]) // BLOCKS
-    means = in_blocks(light, block).mean((1, 3))
-    rows, columns = (n // 2 for n in means.shape[:2])
-    centre = means[rows - 1 : rows + 1, columns - 1 : columns + 1].mean((0, 1))
-    corners = means[[0, 0, -1, -1], [0, -1, 0, -1]].mean(0)
-    ratio = corners / centre
-    colour = ratio[[0, 2]] / ratio[1] - 1
+    side = max(light.shape[0] // 8, light.shape[1] // BLOCKS, 1)
+    top, left = ((n - side) // 2 for n in light.shape[:2])
+    centre = light[top : top + side, left : left + side].mean((0, 1))
+    ends = np.s_[:side], np.s_[-side:]
+    ratios = np.array([light[y, x].mean((0, 1)) / centre for y in ends for x in ends])
+    colour = ratios[:, [0, 2]] / ratios[:, [1]] - 1
     return {
-        "shading": float(100 * ratio[1]),
+        "shading": float(100 * ratios[:, 1].mean()),
+        "darkest_corner": float(100 * ratios[:, 1].min()),
         "color_shading": float(100 * np.abs(colour).max()),
     }
 

@@ -9,7 +9,14 @@ from clpipe.analysis.quality import charts, lens
 from clpipe.analysis.quality.charts import CHECKER, GREY, patch_image, patches_of, slanted_edge
 from clpipe.analysis.quality.colour import checker_errors
 from clpipe.analysis.quality.greys import GreyPatches
-from clpipe.analysis.quality.report import CONTRASTS, MAIN, Curve, Quality, edge_figure
+from clpipe.analysis.quality.report import (
+    CONTRASTS,
+    FIGURES,
+    MAIN,
+    Curve,
+    Quality,
+    edge_figure,
+)
 from clpipe.analysis.quality.simulation import ChartCamera
 from clpipe.analysis.quality.texture import texture_mtf
 from clpipe.analysis.quality.visual_noise import acutance
@@ -65,14 +72,14 @@ def chain_quality(
     parts: tuple[Found, ...] = (
         _edges(camera),
         _texture(camera),
-        grey_figures(greys, 2),
+        grey_figures(greys),
         _colours(camera),
         ({"chroma_edge": _chroma_edge(camera)}, {}),
         (lens_figures(camera, greys, width, height), {}),
     )
-    figures = {key: value for own, _ in parts for key, value in own.items()}
+    measured = {key: value for own, _ in parts for key, value in own.items()}
     curves = {key: value for _, own in parts for key, value in own.items()}
-    return Quality(name, figures, curves)
+    return Quality(name, {key: measured.get(key, np.nan) for key in FIGURES}, curves)
 
 
 def light_of(levels: Array) -> Doubles:
@@ -84,7 +91,8 @@ def developed_greys(camera: ChartCamera) -> GreyPatches:
     """Return pictures of the grey patches."""
     light = charts.grey_steps()
     frames = camera.frames(patch_image(light[:, None].repeat(3, 1)), "greys", FRAMES["greys"])
-    return GreyPatches(light, patches_of(frames.astype(np.float64)))
+    black, *patches = patches_of(frames.astype(np.float64))
+    return GreyPatches(light[1:], np.array(patches), black.mean((0, 1, 2)))
 
 
 def _edges(camera: ChartCamera) -> Found:
@@ -144,19 +152,9 @@ def texture_found(mtf: Doubles) -> Found:
     return figures, {(TEXTURE, ""): Curve(at, mtf)}
 
 
-def grey_figures(greys: GreyPatches, step: int) -> Found:
-    """Return the figures and curves of grey patches.
-
-    Args:
-        greys: the patches.
-        step: the number of patches between those whose contrast is detected.
-    """
+def grey_figures(greys: GreyPatches) -> Found:
+    """Return the figures and curves of grey patches."""
     stops, visible = np.log2(greys.light / GREY), greys.visual_noise()
-    light, detected = greys.detection(step)
-    missed = np.flatnonzero(detected < DETECTED)
-    below = light[light < GREY]
-    dark = missed[missed < len(below)]
-    first = light[dark[-1] + 1] if len(dark) else light[0]
 
     def at_grey(values: Doubles) -> float:
         known = np.isfinite(values)
@@ -170,14 +168,17 @@ def grey_figures(greys: GreyPatches, step: int) -> Found:
         "gamma": at_grey(greys.gamma),
         "clipping": float(np.log2(greys.saturation / GREY)),
         "black": float(greys.luma[0]),
-        "detection": float(np.log2(first / GREY)),
     }
     curves = {
         (TONE, ""): Curve(stops, greys.luma),
         (SNR, ""): Curve(stops, greys.snr),
         (VISIBLE, ""): Curve(stops, visible),
-        (CDP, ""): Curve(np.log2(light / GREY), detected),
     }
+    light, detected = greys.detection()
+    if len(light):
+        missed = np.flatnonzero((detected < DETECTED) & (light < GREY))
+        figures["detection"] = float(np.log2(light[missed[-1] + 1 if len(missed) else 0] / GREY))
+        curves[CDP, ""] = Curve(np.log2(light / GREY), detected)
     return figures, curves
 
 
@@ -187,7 +188,10 @@ def _colours(camera: ChartCamera) -> Found:
     errors = []
     for under_a in (False, True):
         frames = camera.frames(patch_image(charts.checker(under_a)), f"colours {under_a}")
-        errors.append(asdict(checker_errors(patches_of(frames).mean((1, 2, 3)), true)))
+        patches = patches_of(frames).mean((1, 2, 3))
+        if np.ptp(patches, axis=1).max() < 1:  # a monochrome sensor
+            return {}, {}
+        errors.append(asdict(checker_errors(patches, true)))
     by_day, by_lamp = errors
     figures = {key: value for key, value in by_day.items() if key != "grey_level"}
     return {**figures, **{f"{key}_a": by_lamp[key] for key in ("delta_e", "white_balance")}}, {}
@@ -229,11 +233,12 @@ def lens_figures(
     )
     tiled = np.tile(slanted_edge(MAIN, 20.0), (height // 120 + 1, width // 120 + 1, 1))
     [edges] = camera.frames(tiled[:height, :width], "corners", whole=True)
-    middle = np.s_[height // 2 - 120 : height // 2 + 120, width // 2 - 120 : width // 2 + 120]
-    corners = [
-        np.s_[y, x] for y in (np.s_[:240], np.s_[-240:]) for x in (np.s_[:240], np.s_[-240:])
-    ]
-    outer, inner = ([e for at in part for e in edges_in(edges[at])] for part in (corners, [middle]))
+    side = min(240, *(n // 2 for n in edges.shape[:2]))
+    ends = np.s_[:side], np.s_[-side:]
+    corners = [edges[y, x] for y in ends for x in ends]
+    top, left = ((n - side) // 2 for n in edges.shape[:2])
+    middle = edges[top : top + side, left : left + side]
+    outer, inner = ([e for part in parts for e in edges_in(part)] for parts in (corners, [middle]))
     grid = lens.dot_grid(light_of(dotted))
     figures = {
         **lens.shading(greys.light_at(field)),

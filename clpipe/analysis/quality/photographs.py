@@ -1,17 +1,18 @@
 """Measures pictures of real charts, which are found in them or in named areas."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from clpipe.analysis.crops import choose_crops
+from clpipe.analysis.crops import MANUAL, Crop
 from clpipe.analysis.quality import lens
 from clpipe.analysis.quality.charts import CHECKER, GREYS
 from clpipe.analysis.quality.checker import find_checker
 from clpipe.analysis.quality.colour import checker_errors
-from clpipe.analysis.quality.greys import GreyPatches
+from clpipe.analysis.quality.greys import ROUNDING, GreyPatches
 from clpipe.analysis.quality.measure import (
     Found,
     edge_found,
@@ -28,29 +29,59 @@ from clpipe.images.read import read_finished
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.image import in_blocks
 
-MEANINGS = ("black", "white", "texture", "grey")  # names of areas that no chart identifies
+# The least side in px of an area: of one with an edge or chart, and of those with a name.
+LEAST = {"": 40, "black": 8, "white": 8, "texture": 256, "grey": 64}
 UNEVEN = 0.03  # of the light of a flat field, the largest rms difference from a smooth fall-off
+GRAIN = 0.25  # the largest standard deviation within its blocks
 NOTHING = (
     "no chart was found: neither a ColorChecker, a grid of dots, a flat field, nor 12 straight, "
     "isolated edges; name the area of an edge or chart (--roi X,Y,WxH)"
 )
 
 
-def read_levels(path: Path) -> Array:
-    """Return a finished picture, (height, width, 3) uint8.
+def read_levels(path: Path) -> tuple[Array, tuple[str, ...]]:
+    """Return a finished picture, (height, width, 3) uint8, and warnings about it.
 
     Raises:
-        ImageError: the file cannot be read, or is not a finished picture in colour.
+        ImageError: the file cannot be read, is not a finished picture in colour, or is too small.
     """
     source = read_finished(path)
     if source is None:
         raise ImageError(
             f"{path}: this is not a finished picture; give a JPEG, PNG or TIFF in colour"
         )
-    return to_8_bit(source.pixels)
+    height, width = source.pixels.shape[:2]
+    if min(height, width) < LEAST[""]:
+        raise ImageError(
+            f"{path}: this picture has {width}x{height} px; a side needs at least {LEAST['']} px"
+        )
+    return to_8_bit(source.pixels), source.warnings
 
 
-def picture_quality(path: Path, areas: Sequence[str] = ()) -> Quality:
+def area_in(text: str, picture: Array, path: Path) -> Crop:
+    """Return an area of a picture.
+
+    Raises:
+        RequestError: the text is not ``[NAME=]X,Y,WxH``, or the area is too small or outside.
+    """
+    match = MANUAL.fullmatch(text)
+    name = (match["name"] or "") if match else ""
+    if match is None or name not in LEAST:
+        raise RequestError(
+            f"--roi: found {text!r}; expected X,Y,WxH in px from the left and the top, such as "
+            f"120,80,160x160, or one of {', '.join(filter(None, LEAST))} and = before it"
+        )
+    crop = Crop(name, *map(int, re.split("[,x]", match["box"])))
+    height, width = picture.shape[:2]
+    if not crop.within(width, height) or min(crop.width, crop.height) < LEAST[name]:
+        raise RequestError(
+            f"{path}: --roi {text}: this area is outside the picture or too small; choose one "
+            f"inside {width}x{height} px, with sides of at least {LEAST[name]} px"
+        )
+    return crop
+
+
+def picture_quality(path: Path, areas: Sequence[str] = (), name: str = "") -> Quality:
     """Return what the charts of a picture show about its camera.
 
     Args:
@@ -59,24 +90,30 @@ def picture_quality(path: Path, areas: Sequence[str] = ()) -> Quality:
             "white" are a light trap and the white around it, for veiling glare. "texture" is a dead
             leaves chart, and "grey" an even patch next to it, whose noise is subtracted. Without
             areas, charts are sought in the whole picture.
+        name: of the picture in the report; "" is that of its file.
 
     Raises:
         ImageError: the file cannot be read, or shows no chart.
-        RequestError: an area is not valid, is outside the picture, or has no chart.
+        RequestError: an area is not valid, or has no chart.
     """
-    picture = read_levels(path)
-    crops = choose_crops(areas, np.asarray(picture / 255, np.float32)) if areas else []
-    named = {crop.name: crop.of(picture) for crop in crops if crop.name in MEANINGS}
+    picture, warnings = read_levels(path)
+    crops = [area_in(text, picture, path) for text in areas]
+    named = {crop.name: light_of(crop.of(picture)) for crop in crops if crop.name}
     parts = {**_glare(named), **_texture(named)}
     edges = []
-    for crop in (crop for crop in crops if crop.name not in MEANINGS):
+    for crop in (crop for crop in crops if not crop.name):
         edge = edge_of(light_of(crop.of(picture)))
         found = {} if edge else charts_in(crop.of(picture))
         edges += [edge] if edge else []
         if not edge and not found:
             raise RequestError(
                 f"{path}: --roi {crop.box}: this area has no edge, ColorChecker, grid of dots or "
-                "flat field; choose one with 40 px to both sides of a straight edge"
+                "flat field. Choose one with 40 px to both sides of a straight edge. The edge must "
+                "be turned by about 5 degrees against the pixels"
+            )
+        if twice := found.keys() & parts:
+            raise RequestError(
+                f"{path}: --roi: two areas have a {min(twice)}; measure one at a time"
             )
         parts |= found
     if edges:
@@ -89,7 +126,7 @@ def picture_quality(path: Path, areas: Sequence[str] = ()) -> Quality:
         raise ImageError(f"{path}: {NOTHING}")
     figures = {key: value for own, _ in parts.values() for key, value in own.items()}
     curves = {key: value for _, own in parts.values() for key, value in own.items()}
-    return Quality(path.name, figures, curves, tuple(parts))
+    return Quality(name or path.name, figures, curves, tuple(parts), warnings)
 
 
 def charts_in(picture: Array) -> dict[str, Found]:
@@ -97,8 +134,8 @@ def charts_in(picture: Array) -> dict[str, Found]:
     light = light_of(picture)
     if (patches := find_checker(picture)) is not None:
         errors = asdict(checker_errors(patches.mean((1, 2)), np.array(CHECKER, np.float64)))
-        figures, curves = grey_figures(checker_greys(patches), 1)
-        return {"ColorChecker": ({**figures, **errors}, curves)}
+        figures, curves = grey_figures(checker_greys(patches))
+        return {"ColorChecker": ({**errors, **figures}, curves)}
     if (grid := lens.dot_grid(light)) is not None:
         return {"dots": (lens.dot_figures(*grid), {})}
     if is_flat(light):
@@ -109,7 +146,7 @@ def charts_in(picture: Array) -> dict[str, Found]:
 def checker_greys(patches: Doubles) -> GreyPatches:
     """Return the grey patches of a ColorChecker, from (24, side, side, 3) levels."""
     light = light_of(np.array(CHECKER[GREYS])) @ LUMINANCE
-    return GreyPatches(light[::-1], patches[GREYS][::-1, None])
+    return GreyPatches(light[::-1], patches[GREYS][::-1, None], rounding=ROUNDING)
 
 
 def is_flat(light: Doubles) -> bool:
@@ -118,30 +155,33 @@ def is_flat(light: Doubles) -> bool:
     >>> is_flat(np.ones((64, 64, 3))), is_flat(np.eye(64)[..., None] + np.ones(3))
     (True, False)
     """
-    means = in_blocks(light, max(max(light.shape[:2]) // lens.BLOCKS, 1)).mean((1, 3)) @ LUMINANCE
+    blocks = in_blocks(light @ LUMINANCE, max(min(light.shape[:2]) // lens.BLOCKS, 1))
+    means, grain = blocks.mean((1, 3)), np.median(blocks.std((1, 3)))
     y, x = (np.linspace(-1, 1, n) for n in means.shape)
     y, x = np.broadcast_arrays(y[:, None], x)
     terms = np.stack([x**i * y**j for i in range(5) for j in range(5 - i)], axis=-1)
     fitted, *_ = np.linalg.lstsq(terms.reshape(means.size, -1), means.ravel(), rcond=None)
     rest = means.ravel() - terms.reshape(means.size, -1) @ fitted
-    return bool(np.sqrt(np.mean(rest**2)) < UNEVEN * means.mean())
+    even = np.sqrt(np.mean(rest**2)) < UNEVEN * means.mean()
+    return bool(even and grain < GRAIN * means.mean())
 
 
-def _glare(named: dict[str, Array]) -> dict[str, Found]:
+def _glare(named: dict[str, Doubles]) -> dict[str, Found]:
     """Return the veiling glare of a light trap and the white around it (ISO 18844:2017)."""
     if not {"black", "white"} & named.keys():
         return {}
     if not {"black", "white"} <= named.keys():
         raise RequestError("--roi: veiling glare needs two areas, black=X,Y,WxH and white=X,Y,WxH")
-    black, white = (
-        float((light_of(named[name]) @ LUMINANCE).mean()) for name in ("black", "white")
-    )
+    black, white = (float((named[each] @ LUMINANCE).mean()) for each in ("black", "white"))
+    if black >= white:
+        raise RequestError("--roi: the area black= is not darker than white=; exchange them")
     return {"light trap": ({"glare": 100 * black / white}, {})}
 
 
-def _texture(named: dict[str, Array]) -> dict[str, Found]:
+def _texture(named: dict[str, Doubles]) -> dict[str, Found]:
     """Return the texture of a dead leaves chart."""
     if "texture" not in named:
+        if "grey" in named:
+            raise RequestError("--roi: grey= belongs to a texture; add texture=X,Y,WxH")
         return {}
-    grey = light_of(named["grey"]) if "grey" in named else None
-    return {"texture": texture_found(printed_texture_mtf(light_of(named["texture"]), grey))}
+    return {"texture": texture_found(printed_texture_mtf(named["texture"], named.get("grey")))}

@@ -76,6 +76,7 @@ FIGURES: Mapping[str, Figure] = {
     "delta_e_a": Figure("Colour", "CIEDE2000 under light A, mean"),
     "white_balance_a": Figure("Colour", "white balance error under light A, C*"),
     "shading": Figure("Lens", "light in the corners, % of the centre"),
+    "darkest_corner": Figure("Lens", "light in the darkest corner, % of the centre"),
     "color_shading": Figure("Lens", "colour shading, %"),
     "distortion": Figure("Lens", "distortion farthest from the centre, %", ".2f"),
     "most_distortion": Figure("Lens", "largest distortion, %", ".2f"),
@@ -106,12 +107,14 @@ class Quality:
         figures: values by names in :data:`FIGURES`; NaN if they could not be measured.
         curves: curves by title and label.
         found: the charts that a picture has; empty for a simulated camera.
+        warnings: about the picture's file.
     """
 
     name: str
     figures: Mapping[str, float]
     curves: Mapping[tuple[str, str], Curve] = field(default_factory=dict)
     found: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:
         """Return the report as JSON values; figures that could not be measured are null."""
@@ -124,6 +127,7 @@ class Quality:
         return {
             "name": self.name,
             "found": list(self.found),
+            "warnings": list(self.warnings),
             **json_value(sections),
             "curves": json_value(curves),
         }
@@ -134,7 +138,7 @@ def table(reports: Sequence[Quality]) -> list[tuple[str, str, list[str]]]:
     rows = []
     for name, figure in FIGURES.items():
         values = [report.figures.get(name, math.nan) for report in reports]
-        if not all(map(math.isnan, values)):
+        if any(name in report.figures for report in reports):
             cells = ["-" if math.isnan(v) else format(v, f"z{figure.form}") for v in values]
             rows.append((figure.section, figure.text, cells))
     return rows
