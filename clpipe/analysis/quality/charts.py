@@ -13,6 +13,7 @@ from clpipe.reference.transfer import inverse_srgb_curve
 
 GREY = 0.18  # the linear level of a middle grey
 SIDE, BORDER, ROW = 128, 8, 6  # px of a patch, and of background around it; patches in a row
+
 # EV of the grey patches, from a middle grey: in steps of 0.5, and finer where highlights clip.
 STOPS = np.concatenate([np.arange(-21, 0) / 2, np.arange(44) / 10])
 SMALLEST = 0.6  # px, the radius of the smallest of the dead leaves

@@ -117,7 +117,7 @@ class GreyPatches:
     def detection(self) -> tuple[Doubles, Doubles]:
         """Return luminances, and the probability that a contrast of 2:1 is detected there.
 
-        It is the share of pairs of pixels, one of each of two patches, whose Michelson contrast in
+        It is a share of pairs of pixels, one of each of two patches. Their Michelson contrast in
         luminance is within 50 % of that of the patches (Geese, Seger and Paolillo, "Detection
         probabilities", EI 2018). There are no values without patches of this contrast.
         """
