@@ -17,6 +17,7 @@ from clpipe.base.url_text import local_path
 from clpipe.base.validation import first_fault
 from clpipe.camera.gain_stage import GainStage, NotNegative, Offsets, Positive, TukeyLambda
 from clpipe.camera.noise import NoiseModel
+from clpipe.camera.sensitivities import Sensitivities
 from clpipe.camera.text import normalized_name
 
 DEFAULT_CAMERA = "sony-a7r2"
@@ -113,6 +114,7 @@ class Camera(BaseModel):
     photodiode_ratio: Annotated[float, Field(gt=1, le=10_000)] | None = None
     photodiode_crosstalk: Annotated[float, Field(ge=0, le=0.5)] | None = None
     pixel_pitch: Positive | None = None  # um; between the centres of adjacent photosites
+    sensitivities: Sensitivities | None = None  # response of each colour by wavelength
     iso_range: tuple[Positive, Positive]
     gain_stages: Annotated[tuple[GainStage, ...], Field(min_length=1)]
     sources: dict[str, str]

@@ -13,6 +13,7 @@ def profile_text(
     values: Mapping[str, Any],
     gain_stages: Sequence[Mapping[str, Sequence[float]]],
     sources: Mapping[str, str],
+    tables: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> str:
     """Return the text of a profile, for :func:`clpipe.camera.profile.load_camera`.
 
@@ -20,10 +21,17 @@ def profile_text(
         values: the keys of :class:`clpipe.camera.profile.Camera` that are in no table.
         gain_stages: the tables of each :class:`clpipe.camera.profile.GainStage`.
         sources: the source of each figure.
+        tables: further tables, which may have tables themselves.
     """
     lines = _lines(values)
     for stage in gain_stages:
         lines += ["", "[[gain_stages]]", *_lines(stage)]
+    for name, table in (tables or {}).items():
+        inner = {key: value for key, value in table.items() if isinstance(value, Mapping)}
+        plain = {key: value for key, value in table.items() if key not in inner}
+        lines += ["", f"[{name}]", *_lines(plain)]
+        for key, own in inner.items():
+            lines += ["", f"[{name}.{key}]", *_lines(own)]
     lines += ["", "[sources]", *_lines(sources)]
     return "\n".join(lines) + "\n"
 

@@ -14,6 +14,7 @@ from clpipe.camera.profile import (
     cameras_matching,
     load_camera,
 )
+from clpipe.camera.sensitivities import Sensitivities
 from clpipe.commands.completion import cameras_or_import
 from clpipe.commands.options import EXISTING, Command, json_option, output_option
 from clpipe.commands.printing import Rows, short_text, show, show_json
@@ -34,6 +35,7 @@ UNITS = {
     "dark_shading_length": "px",
     "banding_period": "rows",
     "xyz_to_camera": "XYZ to camera RGB",
+    "sensitivities": "peaks",
 }
 # Fields that only some sensors have. A profile without them has no unknown values.
 SPECIAL: tuple[str, ...] = ("aliases", "filter_array", "row_noise_ratio", "column_noise_ratio")
@@ -48,20 +50,27 @@ UNKNOWN = "unknown"
 @click.command("import", cls=Command)
 @click.argument("path", metavar="FILE", type=EXISTING)
 @click.option(
-    "--camera", metavar="NAME", help="The make and model of a camera in a noiseprofiles.json."
+    "--camera",
+    metavar="NAME",
+    help="The make and model of a camera in a noiseprofiles.json. For sensitivities, the camera or "
+    "profile whose noise and levels the new profile has.",
 )
 @output_option("FILE.toml", "The profile to write. [default: it is printed]", required=False)
 @json_option
 def import_command(path: Path, camera: str | None, output: Path | None, as_json: bool) -> None:
-    """Make a camera profile from another program's noise model.
+    """Make a camera profile from another program's noise model, or add spectral sensitivities.
 
     FILE is a DNG with a NoiseProfile, an Android noise model (the text that CameraITS generates and
     that device trees contain), or darktable's noiseprofiles.json. The profile lists which values
     are from the file and which are assumed.
 
+    FILE may also have spectral sensitivities: a JSON of rawtoaces, or a CSV with the columns
+    wavelength (nm), R, G and B. They are added to the profile of --camera.
+
     \b
     clpipe cameras import photo.dng -o my_camera.toml
     clpipe cameras import noiseprofiles.json --camera "Nikon D810"
+    clpipe cameras import curves.csv --camera nikon-d800 -o d800.toml
     """
     from clpipe.analysis.noise_models.read import import_camera
 
@@ -209,6 +218,8 @@ def known_text(camera: Camera, key: str) -> str:
     """
     is_known = key in camera.model_fields_set or key in DERIVED
     value = getattr(camera, key)
+    if isinstance(value, Sensitivities):
+        return value.summary
     return short_text(value) if is_known and value is not None else UNKNOWN
 
 
@@ -264,7 +275,8 @@ def camera_record(camera: Camera, iso: float | None = None) -> dict[str, Any]:
     return {
         "make": camera.make,
         "model": camera.model,
-        **{key: getattr(camera, key) for key in FIXED},
+        **{key: getattr(camera, key) for key in FIXED if key != "sensitivities"},
+        "sensitivities": camera.sensitivities and camera.sensitivities.model_dump(),
         "unknown": [k for k in FIXED if k not in SPECIAL and known_text(camera, k) == UNKNOWN],
         "noise": records_at(camera, iso),
         "sources": camera.sources,

@@ -1,22 +1,29 @@
 """Reads a noise model of another program, whose format is detected, as a camera profile."""
 
 from pathlib import Path
+from typing import Any
 
-from clpipe.analysis.noise_models import android, darktable
+from clpipe.analysis.noise_models import android, darktable, sensitivities
 from clpipe.analysis.noise_models.android import parse_android
 from clpipe.analysis.noise_models.darktable import parse_darktable
 from clpipe.analysis.noise_models.dng import read_dng
 from clpipe.analysis.noise_models.model import SensorModel
+from clpipe.analysis.noise_models.sensitivities import (
+    parse_csv,
+    parse_rawtoaces,
+    with_sensitivities,
+)
 from clpipe.base.errors import RequestError
 from clpipe.base.files import write_new
 from clpipe.base.reading import check_exists, parse_json, read_start, read_text
 from clpipe.camera.profile import Camera, parse_camera
+from clpipe.camera.sensitivities import Sensitivities
 from clpipe.camera.text import check_profile_name
 
 TIFF = (b"II*\0", b"MM\0*")
 READ = (
-    "give a DNG with a NoiseProfile, an Android noise model (the text with noise_model_A) or "
-    "darktable's noiseprofiles.json"
+    "give a DNG with a NoiseProfile, an Android noise model (the text with noise_model_A), "
+    "darktable's noiseprofiles.json, or spectral sensitivities (rawtoaces' JSON, or a CSV)"
 )
 
 
@@ -24,8 +31,10 @@ def import_camera(path: Path, camera: str | None, output: Path | None) -> tuple[
     """Make a camera profile from a file with a noise model, and write it if ``output`` is set.
 
     Args:
-        path: a DNG with a NoiseProfile, an Android noise model, or darktable's noiseprofiles.json.
-        camera: the camera to choose if the file has several.
+        path: a DNG with a NoiseProfile, an Android noise model, darktable's noiseprofiles.json, or
+            spectral sensitivities: rawtoaces' JSON or a CSV.
+        camera: the camera to choose if the file has several; for sensitivities, the camera whose
+            noise and levels the profile has.
         output: the file for the profile, ending in .toml. An existing file is replaced.
 
     Returns:
@@ -38,12 +47,48 @@ def import_camera(path: Path, camera: str | None, output: Path | None) -> tuple[
     """
     if output:
         check_profile_name(output)
-    model = read_model(path, camera)
-    text = model.profile(output.stem if output else model.name)
+    name = output.stem if output else None
+    if (found := read_sensitivities(path)) is not None:
+        text = with_sensitivities(camera, name, *found, path)
+    else:
+        model = read_model(path, camera)
+        text = model.profile(name or model.name)
     made = parse_camera(text, f"{path}: makes no valid profile")
     if output:
         write_new(output, text.encode())
     return text, made
+
+
+def read_sensitivities(path: Path) -> tuple[Sensitivities, str] | None:
+    """Return the sensitivities of a file with their source; None if it has none.
+
+    Raises:
+        RequestError: the file cannot be read, or is damaged.
+    """
+    check_exists(path)
+    try:
+        if b"\0" in read_start(path, 512):
+            return None
+        text = read_text(path)
+    except (OSError, UnicodeDecodeError):
+        return None
+    if text.lstrip().startswith("{") and f'"{sensitivities.MARK}"' in text:
+        return parse_rawtoaces(json_of(text, path), path)
+    if path.suffix.lower() == ".csv" and text.strip():
+        return parse_csv(text, path)
+    return None
+
+
+def json_of(text: str, path: Path) -> Any:
+    """Return the values of JSON.
+
+    Raises:
+        RequestError: it is not valid.
+    """
+    try:
+        return parse_json(text)
+    except ValueError as error:
+        raise RequestError(f"{path}: this file is damaged, or not valid JSON: {error}") from None
 
 
 def read_model(path: Path, camera: str | None) -> SensorModel:
@@ -71,13 +116,7 @@ def read_model(path: Path, camera: str | None) -> SensorModel:
     if is_tiff:
         return read_dng(path)
     if is_darktable:
-        try:
-            values = parse_json(text)
-        except ValueError as error:
-            raise RequestError(
-                f"{path}: this file is damaged, or not valid JSON: {error}"
-            ) from None
-        return parse_darktable(values, path, camera)
+        return parse_darktable(json_of(text, path), path, camera)
     if android.MARK in text:
         return parse_android(text, path)
     found = "text without a noise model" if text.strip() else "neither text nor a DNG"
