@@ -333,7 +333,11 @@ def test_every_value_of_a_profile_is_shown(name):
     record = camera_record(camera)
     titles = {"make", "model"}
     assert all(getattr(camera, key) in tables[0][0] for key in titles)
-    for key in camera.model_fields_set - titles - {"gain_stages", "sources"}:
+    if curves := camera.sensitivities:
+        assert shown["sensitivities"] == curves.summary
+        assert record["sensitivities"] == curves.model_dump()
+    others = {"gain_stages", "sources", "sensitivities"}
+    for key in camera.model_fields_set - titles - others:
         assert shown[key] == short_text(getattr(camera, key))
         assert record[key] == getattr(camera, key) and key not in record["unknown"]
     columns = {

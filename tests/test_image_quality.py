@@ -303,6 +303,47 @@ def test_a_turned_color_checker_is_found(angle, size, squeeze):
     assert errors.hue < 2
 
 
+def in_a_photograph(number):
+    """A ColorChecker in the middle of a photograph: turned, tilted, tinted, blurred, with noise."""
+    from scipy.ndimage import gaussian_filter
+
+    random, photograph = np.random.default_rng(number), photographs()[number % 4]
+    width, height = 900, 900
+    chart = turned_checker(700, 0, 0.68)
+    tall, wide = chart.shape[:2]
+    scale, angle = random.uniform(0.55, 0.95), random.uniform(0, 2 * np.pi)
+    corners = np.array([(-wide, -tall), (wide, -tall), (wide, tall), (-wide, tall)]) / 2 * scale
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    seen = corners @ turn.T * random.uniform(0.94, 1.06, (4, 1)) + (width / 2, height / 2)
+    rows = []
+    for (u, v), (x, y) in zip([(0, 0), (wide, 0), (wide, tall), (0, tall)], seen, strict=True):
+        rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, u])
+        rows.append([0, 0, 0, x, y, 1, -v * x, -v * y, v])
+    table = np.array(rows)
+    coefficients = np.linalg.solve(table[:, :8], table[:, 8])
+    picture, mask = (
+        np.asarray(
+            Image.fromarray(each).transform(
+                (width, height), Image.Transform.PERSPECTIVE, coefficients, 2
+            )
+        )
+        for each in (chart, np.full(chart.shape, 255, np.uint8))
+    )
+    tint = random.uniform((0.7, 1, 0.7), (1.3, 1, 1.3)) * random.uniform(0.5, 1.1)
+    lit = levels_of(np.clip(inverse_srgb_curve(picture / 255) * tint, 0, 1))
+    behind = np.asarray(Image.fromarray(photograph).resize((width, height)))
+    whole = np.where(mask > 128, lit, behind)
+    blurred = gaussian_filter(whole, (*[random.uniform(0, 1.5)] * 2, 0))
+    return np.uint8(np.clip(blurred + random.normal(0, random.uniform(0, 6), whole.shape), 0, 255))
+
+
+def test_color_checkers_in_photographs_are_found():
+    found = [find_checker(in_a_photograph(number)) for number in range(12)]
+    hues = [checker_errors(p.mean((1, 2)), np.array(CHECKER)).hue for p in found if p is not None]
+    assert len(hues) >= 11
+    assert max(hues) < 20  # of tinted light
+
+
 def test_a_color_checker_under_a_lamp_is_found(camera):
     [picture] = camera(iso=100).frames(patch_image(checker(under_a=True)), "lamp")
     patches = find_checker(np.uint8(np.rint(picture)))

@@ -12,10 +12,10 @@ from clpipe.base.types import Array, Doubles
 from clpipe.reference.image import in_blocks
 from clpipe.reference.transfer import inverse_srgb_curve
 
-SEEN = 480  # px of the longer side of the picture in which patches are sought
+SEEN = (480, 300)  # px of the longer side of the picture in which patches are sought
 ROWS, COLUMNS = 4, 6
 FOUND = 10  # patches of 24 that must be found; the places of the others follow from them
-STEEP = 6.0  # levels per px, above which a pixel is at the border of a patch
+STEEP = (15.0, 6.0, 10.0, 3.0)  # levels per px, above which a pixel is at the border of a patch
 AREA = (25, 0.045)  # of a patch: the least in px, and the largest share of the picture
 MOST_ERROR = 20.0  # mean difference of a* and b* of a chart that is taken for a ColorChecker
 SHARE = 0.4  # of the distance of patches, that is measured
@@ -30,31 +30,38 @@ def find_checker(picture: Array) -> Doubles | None:
     Args:
         picture: sRGB levels, (height, width, 3) uint8.
     """
-    step = max(max(picture.shape[:2]) // SEEN, 1)
-    centres = _patch_centres(in_blocks(picture.astype(np.float64), step).mean((1, 3)))
+    steps = [max(max(picture.shape[:2]) // seen, 1) for seen in SEEN]
+    small = {step: in_blocks(picture, step).mean((1, 3)) for step in steps}
+    for step, steep in product(small, STEEP):
+        for places, centres in _grids(_patch_centres(small[step], steep)):
+            charts = _charts(places, centres * step + (step - 1) / 2)
+            patches = [each for chart in charts if (each := _patches(picture, chart)) is not None]
+            best = min(patches, key=_error, default=None)
+            if best is not None and _error(best) < MOST_ERROR:
+                return best
+    return None
+
+
+def _grids(centres: Doubles) -> Iterator[tuple[Doubles, Doubles]]:
+    """Yield the grids of marks: their rows and columns, and their centres, each (mark, 2)."""
     while len(centres) >= FOUND:  # a picture may have other grids
         apart = np.hypot(*np.moveaxis(centres[:, None] - centres, -1, 0))
         surrounded = int(np.sort(apart, axis=1)[:, 1:5].mean(1).argmin())
         grid = numbered(centres - centres[surrounded], 1)
         assert grid is not None
         places, numbers = grid
-        points = centres[numbers] * step + (step - 1) / 2
-        charts = _charts(places, points) if len(places) >= FOUND else ()
-        patches = [each for chart in charts if (each := _patches(picture, chart)) is not None]
-        best = min(patches, key=_error, default=None)
-        if best is not None and _error(best) < MOST_ERROR:
-            return best
+        if len(places) >= FOUND:
+            yield places, centres[numbers]
         centres = np.delete(centres, numbers, axis=0)
-    return None
 
 
-def _patch_centres(picture: Doubles) -> Doubles:
+def _patch_centres(picture: Doubles, steep: float) -> Doubles:
     """Return the centres of even, square areas of a similar size, (area, 2): y and x."""
     from scipy import ndimage
 
     smooth = ndimage.median_filter(picture, (3, 3, 1))
     slope = np.max([np.hypot(*np.gradient(smooth[..., c])) for c in range(3)], axis=0)
-    labels, count = ndimage.label(slope < STEEP)
+    labels, count = ndimage.label(slope < steep)
     areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     y, x = np.mgrid[: labels.shape[0], : labels.shape[1]].astype(np.float64)
 

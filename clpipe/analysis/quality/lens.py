@@ -25,7 +25,8 @@ def dot_grid(light: Doubles) -> tuple[Doubles, Doubles] | None:
     from scipy import ndimage
 
     green = light[..., 1]
-    white = ndimage.percentile_filter(green[::4, ::4], 90, 25).repeat(4, 0).repeat(4, 1)
+    step = max(4, max(green.shape) // 400)
+    white = ndimage.percentile_filter(green[::step, ::step], 90, 25).repeat(step, 0).repeat(step, 1)
     labels, _ = ndimage.label(green < DARK * white[: green.shape[0], : green.shape[1]])
     areas = np.bincount(labels.ravel())[1:]
     if not MIN_DOTS <= (areas >= SMALLEST).sum() < MOST_DOTS:
