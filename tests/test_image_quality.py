@@ -531,6 +531,14 @@ def test_charts_are_found_in_pictures(pictures):
     assert reports[2]["lens"]["shading"] == pytest.approx(100, abs=1)
 
 
+def test_a_picture_of_one_edge_needs_no_area(pictures):
+    [whole] = quality_of(pictures["edge"])
+    [area] = quality_of(pictures["edge"], "--roi", "0,0,160x160")
+    assert whole["found"] == ["edge"]
+    assert whole["sharpness"] == area["sharpness"]
+    assert all(edge_of(measure.light_of(each), strict=True) is None for each in photographs())
+
+
 def test_areas_of_pictures_are_measured(pictures):
     [edge] = quality_of(pictures["edge"], "--roi", "10,10,140x140")
     assert edge["sharpness"]["mtf50"] == pytest.approx(0.35, abs=0.02)

@@ -93,7 +93,7 @@ def edges_in(picture: Array) -> list[Edge]:
     return found
 
 
-def edge_of(light: Doubles) -> Edge | None:
+def edge_of(light: Doubles, strict: bool = False) -> Edge | None:
     """Return the edge that fills a picture, or None if it has no straight edge.
 
     The edge may be curved by distortion, like a polynomial of the third degree.
@@ -105,6 +105,7 @@ def edge_of(light: Doubles) -> Edge | None:
 
     Args:
         light: linear RGB, (height, width, 3). It should have 40 px to both sides of the edge.
+        strict: whether both sides must be even, so that a photograph is not taken for an edge.
     """
     luma = light @ LUMINANCE
     smooth = luma
@@ -117,7 +118,7 @@ def edge_of(light: Doubles) -> Edge | None:
     room = int(np.abs(np.percentile(distance, [3, 97])).min())
     edge = None
     for reach in sorted({min(each, room) for each in WIDE if room > 2 * FLAT}):
-        edge, profile = _edge(light, distance, reach, False), _profile(distance, luma, reach)
+        edge, profile = _edge(light, distance, reach, strict), _profile(distance, luma, reach)
         if edge is None or profile is None or NARROW * _rise(profile) < reach:
             break
     return edge
@@ -188,7 +189,7 @@ def _edge(light: Doubles, distance: Doubles, reach: int, strict: bool) -> Edge |
     halves = scaled[0].reshape(-1, BINS // 2).mean(1)
     plateau, near = FLAT * 2, halves[FLAT * 2 : -FLAT * 2]
     # The largest of many values exceeds the plateau by about two sigmas of their noise.
-    noise = 0.0 if strict else 2 * max(halves[:plateau].std(), halves[-plateau:].std())
+    noise = 0.0 if reach <= REACH else 2 * max(halves[:plateau].std(), halves[-plateau:].std())
     red, green, blue = (_centre(profile, reach) for profile in scaled[1:])
     plateaus = (abs(distance) > reach - FLAT) & (abs(distance) < reach + 2 * FLAT)
     smooth = np.interp(distance, (np.arange(2 * reach * BINS) + 0.5) / BINS - reach, profiles[0])

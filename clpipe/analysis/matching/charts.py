@@ -55,7 +55,7 @@ def read_charts(paths: Sequence[Path]) -> Charts:
     greys = None
     for path in paths:
         levels, _ = read_levels(path)
-        whole = edge_of(light_of(levels))
+        whole = edge_of(light_of(levels), strict=True)
         patches = None if whole else find_checker(levels)
         found = whole or sharpest(edges_in(levels))
         if patches is None and found is None:

@@ -33,6 +33,7 @@ from clpipe.reference.image import in_blocks
 LEAST = {"": 40, "black": 8, "white": 8, "texture": 256, "grey": 64}
 UNEVEN = 0.03  # of the light of a flat field, the largest rms difference from a smooth fall-off
 GRAIN = 0.25  # the largest standard deviation within its blocks
+MOST_SAMPLES = 3_000_000  # of a picture that may be a crop with one edge
 NOTHING = (
     "no chart was found: neither a ColorChecker, a grid of dots, a flat field, nor 12 straight, "
     "isolated edges; name the area of an edge or chart (--roi X,Y,WxH)"
@@ -120,7 +121,8 @@ def picture_quality(path: Path, areas: Sequence[str] = (), name: str = "") -> Qu
         parts["edge"] = edge_found(median_edge(edges), MAIN)
     if not areas:
         parts = charts_in(picture)
-        if edge := sharpest(edges_in(picture)):
+        whole = picture.size < MOST_SAMPLES and edge_of(light_of(picture), strict=True)
+        if edge := median_edge([whole]) if whole else sharpest(edges_in(picture)):
             parts["edge"] = edge_found(edge, MAIN)
     if not parts:
         raise ImageError(f"{path}: {NOTHING}")
