@@ -11,6 +11,7 @@ from clpipe.base.text import printable
 from clpipe.images.attributes import clpipe_attributes
 from clpipe.images.kinds import is_aov
 from clpipe.images.openimageio import MAX_PARTS, parts_of
+from clpipe.images.spectral import spectra_in
 
 # Names of layers that hold the finished picture, in order of preference, in lower-case letters. The
 # first are channels R, G and B without a layer: Nuke, Arnold, V-Ray, Mitsuba, Octane, Unreal.
@@ -117,6 +118,11 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
                 pictures.append(PictureLocation(part, full, channels, xyz, view, name))
     if not pictures and rejections:
         raise ImageError(f"{path}: {rejections[0]}")
+    if not pictures and (spectra := spectra_in(channel_names)) and not mosaic:
+        raise NoPictureError(
+            f"{path}: there are no R, G and B channels, but {' and '.join(map(str, spectra))}",
+            "clpipe reads RGB only, so let the renderer write R, G and B as well",
+        )
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
         missing = "several channels, but a mosaic has one" if mosaic else "no R, G and B channels"

@@ -17,6 +17,7 @@ from clpipe.images.colour import CIE_XYZ
 from clpipe.images.colour_names import ColourSpace, space_of
 from clpipe.images.openimageio import radiance_header
 from clpipe.images.pixels import convert_by_rows
+from clpipe.images.spectral import spectra_in
 from clpipe.images.tags import FLIPS, upright
 from clpipe.images.vocabularies import vocabulary_warnings
 
@@ -80,7 +81,8 @@ def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
         ImageError: the file cannot be read.
     """
     spec, format_ = file.spec(), file.format_name()
-    warnings = []
+    bands = map(str, spectra_in(spec.channelnames))
+    warnings = [f"its {each} are not used; its R, G and B were read" for each in bands]
     aspect = spec.getattribute("PixelAspectRatio")
     header = radiance_header(path) if format_ == "hdr" else None
     if header:
