@@ -15,6 +15,7 @@ from clpipe.analysis.quality.charts import (
     GREY,
     checker,
     dead_leaves,
+    disc,
     dots,
     grey,
     grey_steps,
@@ -94,6 +95,26 @@ def test_the_chart_of_an_edge_is_the_mean_over_square_pixels(angle):
     share = bright.reshape(size, samples, size, samples).mean((1, 3))
     chart = (slanted_edge(4, angle, size)[..., 0] - GREY / 2) / (GREY * 1.5)
     assert np.abs(chart - share).max() < 0.02
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.6, 2.0, 7.3])
+def test_discs_are_exact(radius):
+    samples, random = 64, np.random.default_rng(10)
+    y, x = random.uniform(9, 10, 2)
+    at, fine = np.arange(20.0), (np.arange(20 * samples) + 0.5) / samples - 0.5
+    inside = np.hypot(fine - x, fine[:, None] - y) < radius
+    share = inside.reshape(20, samples, 20, samples).mean((1, 3))
+    found = disc(radius, at - y, at - x)
+    assert np.abs(found - share).max() < 0.01
+    assert found.sum() == pytest.approx(np.pi * radius**2, rel=1e-12)
+
+
+@pytest.mark.parametrize("width", [480, 481])
+def test_a_dot_is_in_the_middle(width):
+    dark = 0.5 - dots(width, 400)[200 - 20 : 200 + 20, width // 2 - 20 : (width + 1) // 2 + 20, 0]
+    for part in (dark, dark[::-1], dark[:, ::-1]):
+        assert part == pytest.approx(dark, abs=1e-6)
+    assert dark.sum() / 0.48 == pytest.approx(np.pi * 64, rel=1e-5)
 
 
 @pytest.mark.parametrize("angle", [3.0, *ANGLES, 110.0, 200.0])
@@ -610,13 +631,14 @@ def test_compare_shows_sharpness_and_level(tmp_path):
     from scipy.ndimage import gaussian_filter
 
     sharp = np.tile(slanted_edge(4, 20.0), (2, 3, 1)).astype(float)
-    for name, light in (("sharp", sharp), ("blunt", gaussian_filter(sharp, (1, 1, 0)))):
+    pictures = {"sharp": sharp, "blunt": gaussian_filter(sharp, (1, 1, 0))}
+    for name, light in pictures.items():
         save(tmp_path / f"{name}.png", levels_of(light))
     names = [tmp_path / f"{name}.png" for name in ("sharp", "blunt")]
     words = ("compare", *names, "-o", tmp_path / "figure.png", "--crop", "0,0,64x48")
     found = json.loads(run_cli(*words, "--json").stdout)["looks"]
-    for look, sigma in zip(found, (0, 1), strict=True):
+    for look, sigma, light in zip(found, (0, 1), pictures.values(), strict=True):
         assert look["mtf50"] == pytest.approx(frequency_at(0.5, pixel_mtf(20.0, sigma)), rel=0.05)
-        assert look["level"] == pytest.approx(np.median(levels_of(sharp)), abs=30)
+        assert look["level"] == pytest.approx(np.median(levels_of(light)), abs=0.6)
     printed = run_cli(*words).stdout
     assert "MTF50  overshoot  level" in printed

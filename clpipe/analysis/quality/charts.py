@@ -1,6 +1,7 @@
 """Charts as linear renders, whose pixels are exact means of the scene over a square pixel.
 
-Edges therefore have no aliasing but that of the pixel grid, and the MTF of a square pixel.
+Edges and discs therefore have no aliasing but that of the pixel grid, and the MTF of a square
+pixel. Only where several of the dead leaves share a pixel is their order within it unknown.
 """
 
 from functools import cache
@@ -16,6 +17,7 @@ SIDE, BORDER, ROW = 128, 8, 6  # px of a patch, and of background around it; pat
 
 # EV of the grey patches, from a middle grey: in steps of 0.5, and finer where highlights clip.
 STOPS = np.concatenate([np.arange(-21, 0) / 2, np.arange(44) / 10])
+COVERAGE = 4  # times, by which the leaves cover the chart of dead leaves
 SMALLEST = 0.6  # px, the radius of the smallest of the dead leaves
 PITCH, DOT = 48, 8.0  # px between the dots of the chart of dots, and their radius
 
@@ -138,6 +140,34 @@ def checker(under_a: bool = False) -> Doubles:
     return np.asarray(light @ (np.linalg.inv(SRGB_TO_XYZ) @ adapt @ SRGB_TO_XYZ).T)
 
 
+def disc(radius: float, down: Doubles, across: Doubles) -> Doubles:
+    """Return the share of each square pixel that a disc covers, (row, column).
+
+    >>> at = np.arange(-3.0, 4)
+    >>> share = disc(2.0, at, at)
+    >>> share[3].round(3).tolist(), round(float(share.sum() / 4 / np.pi), 6)
+    ([0.0, 0.479, 1.0, 1.0, 1.0, 0.479, 0.0], 1.0)
+
+    Args:
+        radius: px.
+        down: distances of the middles of rows from the centre, px; each is 1 more than the last.
+        across: distances of the middles of columns from there.
+    """
+    # Borders of pixels, in radii.
+    y, x = (np.append(at - 0.5, at[-1:] + 0.5) / radius for at in (down, across))
+    wide, high = np.minimum(abs(x), 1), np.minimum(abs(y), 1)[:, None]
+    chord = np.sqrt(1 - high**2)  # half of it, at each row's border
+
+    def under(at: Doubles) -> Doubles:  # the integral of the circle's height from 0
+        return (at * np.sqrt(1 - at**2) + np.arcsin(at)) / 2
+
+    # The area of the disc between its centre and each corner of a pixel.
+    beyond = np.where(wide > chord, under(wide) - under(chord), 0)
+    area = high * np.minimum(wide, chord) + beyond
+    signed = area * np.sign(x) * np.sign(y[:, None])
+    return np.asarray(np.diff(np.diff(signed, axis=0), axis=1) * radius**2)
+
+
 @cache
 def dead_leaves(size: int = 512, seed: int = 0) -> Floats:
     """Return overlapping grey discs as a linear render, (size, size, 3) (ISO/TS 19567-2).
@@ -146,7 +176,7 @@ def dead_leaves(size: int = 512, seed: int = 0) -> Floats:
     """
     rng = np.random.default_rng(seed)
     low, high = SMALLEST**-2, (size / 4) ** -2.0
-    count = int(6 * size**2 / (2 * np.pi * SMALLEST**2 * np.log(size / 4 / SMALLEST)))
+    count = int(COVERAGE * size**2 / (2 * np.pi * SMALLEST**2 * np.log(size / 4 / SMALLEST)))
     radii = np.sort((low + rng.random(count) * (high - low)) ** -0.5)[::-1]
     radii = radii[rng.permutation(count)]
     centres = rng.uniform(-size / 8, size * 9 / 8, (count, 2))
@@ -155,26 +185,21 @@ def dead_leaves(size: int = 512, seed: int = 0) -> Floats:
     for (y, x), radius, level in zip(centres, radii, levels, strict=True):
         top, left = (max(int(c - radius - 1), 0) for c in (y, x))
         part = light[top : int(max(y + radius + 2, 0)), left : int(max(x + radius + 2, 0))]
-        down, across = (
-            np.arange(n) + start for n, start in zip(part.shape, (top, left), strict=True)
-        )
-        share = np.clip(radius + 0.5 - np.hypot(across - x, down[:, None] - y), 0, 1)
-        part += share * (level - part)
+        rows, columns = map(np.arange, part.shape)
+        part += disc(radius, rows + (top - y), columns + (left - x)) * (level - part)
     return grey(light)
 
 
 def dots(width: int, height: int) -> Floats:
     """Return black dots in a square grid on white, (height, width, 3), one in the centre."""
-    down, across = (
-        np.abs((np.arange(n) - (n - 1) / 2 + PITCH / 2) % PITCH - PITCH / 2)
-        for n in (height, width)
-    )
-    share = np.clip(DOT + 0.5 - np.hypot(across, down[:, None]), 0, 1)
-    return grey(0.5 - 0.48 * share)
+    sides = (height, width)
+    # The middles of a tile's pixels; the dot is between two of them if the side is even.
+    down, across = (np.linspace(-PITCH, PITCH - 2, PITCH) / 2 + (n + 1) % 2 / 2 for n in sides)
+    places = ((np.arange(n) - n // 2 + PITCH // 2) % PITCH for n in sides)
+    return grey(0.5 - 0.48 * disc(DOT, down, across)[np.ix_(*places)])
 
 
 def glare_spot(width: int, height: int) -> Floats:
     """Return a black spot in the centre of white, (height, width, 3), for veiling glare."""
-    radius = min(width, height) / 20
-    down, across = (np.arange(n) - (n - 1) / 2 for n in (height, width))
-    return grey(np.where(np.hypot(across, down[:, None]) < radius, 0.0, 0.5))
+    down, across = (np.linspace(1 - n, n - 1, n) / 2 for n in (height, width))
+    return grey(0.5 - 0.5 * disc(min(width, height) / 20, down, across))

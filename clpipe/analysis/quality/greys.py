@@ -117,9 +117,9 @@ class GreyPatches:
     def detection(self) -> tuple[Doubles, Doubles]:
         """Return luminances, and the probability that a contrast of 2:1 is detected there.
 
-        It is a share of pairs of pixels, one of each of two patches. Their Michelson contrast in
-        luminance is within 50 % of that of the patches (Geese, Seger and Paolillo, "Detection
-        probabilities", EI 2018). There are no values without patches of this contrast.
+        Each pair takes a pixel from each of two patches. A pair detects the contrast if its own
+        Michelson contrast in luminance differs by at most 50 %. The source is Geese, Seger and
+        Paolillo, "Detection probabilities" (EI 2018). Without such patches there are no values.
         """
         seen = self.light_at(self.levels) @ LUMINANCE
         at, shares, rng = [], [], np.random.default_rng(0)
