@@ -578,16 +578,18 @@ def test_rejected_pictures_and_areas(pictures, tmp_path):
 
     for name in ("noise", "text", "squares"):
         assert "no chart was found" in error(pictures[name], status=1)
-    assert "this area has no edge" in error(pictures["noise"], "--roi", "0,0,100x100")
+    assert "this area has no edge" in error(pictures["noise"], "--roi", "0,0,100x100", status=1)
     for area in ("0,0,900x100", "0,0,20x20", "texture=0,0,100x100", "grey=0,0,30x30"):
-        assert "outside the picture or too small" in error(pictures["edge"], "--roi", area)
+        assert "outside the picture or too small" in error(
+            pictures["edge"], "--roi", area, status=1
+        )
     for area in ("flat", "textur=0,0,90x90", "1,2,3"):
         assert "--roi: found" in error(pictures["edge"], "--roi", area)
     assert "belongs to a texture" in error(pictures["edge"], "--roi", "grey=0,0,90x90")
     swapped = ("--roi", "white=120,120,60x60", "--roi", "black=0,0,90x300")
-    assert "exchange them" in error(pictures["spot"], *swapped)
+    assert "exchange them" in error(pictures["spot"], *swapped, status=1)
     twice = ("--roi", "0,0,768x512", "--roi", "1,1,766x510")
-    assert "two areas have a ColorChecker" in error(pictures["checker"], *twice)
+    assert "two areas have a ColorChecker" in error(pictures["checker"], *twice, status=1)
     assert "at least 40 px" in error(pictures["tiny"], status=1)
     assert "name a PICTURE" in error("--roi", "0,0,10x10")
     assert "needs two areas" in error(pictures["spot"], "--roi", "black=0,0,50x50")
@@ -599,6 +601,10 @@ def test_rejected_pictures_and_areas(pictures, tmp_path):
     result = run_cli("quality", tmp_path / "broken.jpg", pictures["flat"], "--json", status=1)
     assert "broken.jpg" in result.stderr
     assert len(json.loads(result.stdout)["quality"]) == 1
+    words = (pictures["edge"], pictures["flat"], "--roi", "200,200,160x160", "--json")
+    result = run_cli("quality", *words, status=1)  # the area is outside the first picture
+    assert json.loads(result.stdout)["quality"][0]["found"] == ["flat field"]
+    assert "edge.png: --roi 200,200,160x160: this area is outside" in result.stderr
 
 
 def test_a_page_of_a_picture_and_a_camera(pictures, tmp_path):
@@ -606,7 +612,7 @@ def test_a_page_of_a_picture_and_a_camera(pictures, tmp_path):
     chain = ("--camera", "nikon-d800", "--iso", "100,3200", "--set", "sharpen.amount=0.3")
     printed = run_cli("quality", pictures["checker"], *chain, "-o", page).stdout
     text = page.read_text("utf-8")
-    for name in ("checker.png", "nikon-d800, ISO 100", "nikon-d800, ISO 3200", "MTF50, cycles/px"):
+    for name in ("checker", "nikon-d800, ISO 100", "nikon-d800, ISO 3200", "MTF50, cycles/px"):
         assert name in printed and name in text
     assert text.count("<svg") >= 5
     assert not re.findall(r"(?:src|href)=.http", text)

@@ -10,7 +10,7 @@ from clpipe.base.types import Floats, Mask
 from clpipe.chain.making import make_chain
 from clpipe.chain.settings import Settings
 from clpipe.images.raw import RAW_SUFFIXES
-from clpipe.images.read import read_finished, read_image
+from clpipe.images.read import SourceImage, read_finished, read_image
 from clpipe.images.samples import holds_mosaic, photograph_info
 from clpipe.inputs.kept import embedded_settings
 from clpipe.stage import Context, Kind
@@ -124,3 +124,17 @@ def context_after(settings: Settings, stage: str | None) -> Context:
     """
     step = make_chain(settings).step_named(stage or "")
     return step.method.next_context(step.context)
+
+
+def finished_picture(path: Path) -> SourceImage:
+    """Return a finished picture in colour: display values, (height, width, 3), 0 to 1.
+
+    Raises:
+        ImageError: the file cannot be read, or is another kind of image.
+    """
+    source = read_finished(path)
+    if source is None:
+        raise ImageError(
+            f"{path}: this is not a finished picture; give a JPEG, PNG or TIFF in colour"
+        )
+    return source

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from clpipe.analysis.comparison import distinct_names
 from clpipe.analysis.quality.measure import chain_quality
 from clpipe.analysis.quality.photographs import picture_quality
 from clpipe.analysis.quality.report import Quality, table
@@ -99,7 +100,7 @@ def quality(
         raise RequestError("--roi: this option is for pictures of real charts; name a PICTURE")
     is_chosen = any(value not in (None, (), False) for value in options.values())
     chains = list(chains_of(options)) if is_chosen or not pictures else []
-    names = distinct_paths(pictures)
+    names = distinct_names(pictures)
     reports, failures = [], 0
     with status_line() as show_status:
         for path, name in zip(pictures, names, strict=True):
@@ -117,12 +118,6 @@ def quality(
     if reports:
         write(reports, output, as_json)
     sys.exit(1 if failures else 0)
-
-
-def distinct_paths(pictures: tuple[Path, ...]) -> list[str]:
-    """Return the names of files, or their paths if names repeat."""
-    names = [path.name for path in pictures]
-    return names if len(set(names)) == len(names) else list(map(str, pictures))
 
 
 def chains_of(options: dict[str, Any]) -> Iterator[Settings]:

@@ -18,13 +18,13 @@ from clpipe.analysis.matching.columns import (
     block_numbers,
     noise_of_frames,
 )
+from clpipe.analysis.pictures import finished_picture
 from clpipe.analysis.signature import BRIGHTEST, DARK, DRIFT, flat_mask
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.reading import check_input
 from clpipe.base.types import Doubles, Floats, Mask
 from clpipe.base.url_text import local
 from clpipe.images.jpeg import JpegEncoding, jpeg_encoding
-from clpipe.images.read import read_finished
 from clpipe.inputs.find import glob_files
 from clpipe.reference.colour import luma
 from clpipe.reference.image import in_blocks
@@ -190,12 +190,7 @@ def read_picture(path: Path) -> Floats:
     Raises:
         ImageError: the file cannot be read, or is not a finished picture.
     """
-    source = read_finished(path)
-    if source is None:
-        raise ImageError(
-            f"{path}: this is not a finished picture; give a JPEG, PNG or TIFF in colour"
-        )
-    return source.pixels * np.float32(255)
+    return finished_picture(path).pixels * np.float32(255)
 
 
 def encoding_text(encoding: JpegEncoding | None) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from clpipe.analysis.crops import MANUAL, Crop
+from clpipe.analysis.pictures import finished_picture
 from clpipe.analysis.quality import lens
 from clpipe.analysis.quality.charts import CHECKER, GREYS
 from clpipe.analysis.quality.checker import find_checker
@@ -25,7 +26,6 @@ from clpipe.analysis.quality.texture import printed_texture_mtf
 from clpipe.analysis.sharpness import LUMINANCE, edge_of, edges_in, median_edge, sharpest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.types import Array, Doubles
-from clpipe.images.read import read_finished
 from clpipe.reference.curve import to_8_bit
 from clpipe.reference.image import in_blocks
 
@@ -46,11 +46,7 @@ def read_levels(path: Path) -> tuple[Array, tuple[str, ...]]:
     Raises:
         ImageError: the file cannot be read, is not a finished picture in colour, or is too small.
     """
-    source = read_finished(path)
-    if source is None:
-        raise ImageError(
-            f"{path}: this is not a finished picture; give a JPEG, PNG or TIFF in colour"
-        )
+    source = finished_picture(path)
     height, width = source.pixels.shape[:2]
     if min(height, width) < LEAST[""]:
         raise ImageError(
@@ -63,7 +59,8 @@ def area_in(text: str, picture: Array, path: Path) -> Crop:
     """Return an area of a picture.
 
     Raises:
-        RequestError: the text is not ``[NAME=]X,Y,WxH``, or the area is too small or outside.
+        RequestError: the text is not ``[NAME=]X,Y,WxH``.
+        ImageError: the area is too small, or outside the picture.
     """
     match = MANUAL.fullmatch(text)
     name = (match["name"] or "") if match else ""
@@ -75,7 +72,7 @@ def area_in(text: str, picture: Array, path: Path) -> Crop:
     crop = Crop(name, *map(int, re.split("[,x]", match["box"])))
     height, width = picture.shape[:2]
     if not crop.within(width, height) or min(crop.width, crop.height) < LEAST[name]:
-        raise RequestError(
+        raise ImageError(
             f"{path}: --roi {text}: this area is outside the picture or too small; choose one "
             f"inside {width}x{height} px, with sides of at least {LEAST[name]} px"
         )
@@ -94,28 +91,26 @@ def picture_quality(path: Path, areas: Sequence[str] = (), name: str = "") -> Qu
         name: of the picture in the report; "" is that of its file.
 
     Raises:
-        ImageError: the file cannot be read, or shows no chart.
-        RequestError: an area is not valid, or has no chart.
+        ImageError: the file cannot be read, or an area is outside it, or has no chart.
+        RequestError: an area has another form, or lacks its partner.
     """
     picture, warnings = read_levels(path)
     crops = [area_in(text, picture, path) for text in areas]
     named = {crop.name: light_of(crop.of(picture)) for crop in crops if crop.name}
-    parts = {**_glare(named), **_texture(named)}
+    parts = {**_glare(path, named), **_texture(named)}
     edges = []
     for crop in (crop for crop in crops if not crop.name):
         edge = edge_of(light_of(crop.of(picture)))
         found = {} if edge else charts_in(crop.of(picture))
         edges += [edge] if edge else []
         if not edge and not found:
-            raise RequestError(
+            raise ImageError(
                 f"{path}: --roi {crop.box}: this area has no edge, ColorChecker, grid of dots or "
                 "flat field. Choose one with 40 px to both sides of a straight edge. The edge must "
                 "be turned by about 5 degrees against the pixels"
             )
         if twice := found.keys() & parts:
-            raise RequestError(
-                f"{path}: --roi: two areas have a {min(twice)}; measure one at a time"
-            )
+            raise ImageError(f"{path}: --roi: two areas have a {min(twice)}; measure one at a time")
         parts |= found
     if edges:
         parts["edge"] = edge_found(median_edge(edges), MAIN)
@@ -168,7 +163,7 @@ def is_flat(light: Doubles) -> bool:
     return bool(even and grain < GRAIN * means.mean())
 
 
-def _glare(named: dict[str, Doubles]) -> dict[str, Found]:
+def _glare(path: Path, named: dict[str, Doubles]) -> dict[str, Found]:
     """Return the veiling glare of a light trap and the white around it (ISO 18844:2017)."""
     if not {"black", "white"} & named.keys():
         return {}
@@ -176,7 +171,7 @@ def _glare(named: dict[str, Doubles]) -> dict[str, Found]:
         raise RequestError("--roi: veiling glare needs two areas, black=X,Y,WxH and white=X,Y,WxH")
     black, white = (float((named[each] @ LUMINANCE).mean()) for each in ("black", "white"))
     if black >= white:
-        raise RequestError("--roi: the area black= is not darker than white=; exchange them")
+        raise ImageError(f"{path}: --roi: the area black= is not darker than white=; exchange them")
     return {"light trap": ({"glare": 100 * black / white}, {})}
 
 
