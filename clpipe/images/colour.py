@@ -6,6 +6,7 @@ import numpy as np
 
 from clpipe.base.errors import ImageError
 from clpipe.base.types import Array, Floats
+from clpipe.camera.colorimetry import adaptation
 
 # x and y of red, green, blue and white: ITU-R BT.709-6 (2015), which sRGB shares.
 SRGB = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -13,11 +14,6 @@ MAX_CHROMATICITY = (
     100.0  # the largest absolute x or y; wide colour spaces have values within -1 to 2
 )
 CIE_XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
-
-# Cone response of the Bradford transform (Lam 1985), after B. Lindbloom, "Chromatic Adaptation".
-BRADFORD = np.array(
-    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
-)
 
 
 def rgb_to_xyz(chromaticities: Sequence[float]) -> Array:
@@ -63,17 +59,6 @@ def _numbers(name: str, values: object, count: int) -> Array:
     if numbers.shape != (count,):
         raise ImageError(f"its attribute {name} must be {count} numbers, but is not")
     return numbers
-
-
-def adaptation(source_white: Array, target_white: Array) -> Array:
-    """The 3x3 matrix on CIE XYZ that maps one white to another (linear Bradford transform).
-
-    Args:
-        source_white: X, Y and Z.
-        target_white: X, Y and Z.
-    """
-    gains = (BRADFORD @ target_white) / (BRADFORD @ source_white)
-    return np.linalg.inv(BRADFORD) @ (gains[:, None] * BRADFORD)
 
 
 def to_linear_srgb(

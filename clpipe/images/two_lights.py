@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from clpipe.base.types import Doubles
+from clpipe.camera.colorimetry import adaptation
 from clpipe.camera.profile import SRGB_TO_XYZ
-from clpipe.images.colour import adaptation
 
 # Temperatures in K of EXIF's light sources.
 TEMPERATURES = {1: 5500, 2: 4230, 3: 2856, 4: 5500, 9: 5500, 10: 6504, 11: 7504, 12: 6430, 13: 5000}

@@ -6,9 +6,9 @@ from itertools import product
 import numpy as np
 
 from clpipe.analysis.quality.charts import CHECKER, GREYS
-from clpipe.analysis.quality.colour import lab_of
 from clpipe.analysis.quality.grids import numbered
 from clpipe.base.types import Array, Doubles
+from clpipe.camera.colorimetry import lab_of
 from clpipe.reference.image import in_blocks
 from clpipe.reference.transfer import inverse_srgb_curve
 

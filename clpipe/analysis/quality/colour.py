@@ -6,7 +6,7 @@ import numpy as np
 
 from clpipe.analysis.quality.charts import GREYS
 from clpipe.base.types import Doubles
-from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.camera.colorimetry import lab_of
 from clpipe.reference.transfer import inverse_srgb_curve
 
 HAS_HUE = 10.0  # the lowest chroma at which hues are compared
@@ -20,16 +20,6 @@ def cielab(levels: Doubles) -> Doubles:
     [[100.0, 0.0, 0.0], [51.2, 0.0, 0.0], [53.2, 80.1, 67.2]]
     """
     return lab_of(inverse_srgb_curve(np.asarray(levels) / 255))
-
-
-def lab_of(light: Doubles) -> Doubles:
-    """Convert linear sRGB to CIELAB under D65, (..., 3)."""
-    ratio = light @ (SRGB_TO_XYZ / SRGB_TO_XYZ.sum(1, keepdims=True)).T
-    cubes = ratio > (6 / 29) ** 3
-    x, y, z = np.moveaxis(
-        np.where(cubes, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29), -1, 0
-    )
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
 def delta_e_2000(one: Doubles, two: Doubles, lightness: bool = True) -> Doubles:
