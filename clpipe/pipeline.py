@@ -259,7 +259,7 @@ class Pipeline(ReadOnly):
                 "Use clpipe run, which reads the layer from the render's file"
             )
         try:
-            checked = earlier.pixels if earlier else as_image(image, chain.source)
+            checked = earlier.pixels if earlier else as_image(image, chain.source, chain.bands)
         except ImageError as error:
             raise ImageError(f"{key}: {error}" if key else str(error)) from None
         margins = margins_of_array(overscan, checked)

@@ -355,7 +355,7 @@ class Stream:
 
         The second frame of a sequence needs other kernels than the first one.
         """
-        as_image(self._light(frame), self._pipeline.chain.source)
+        as_image(self._light(frame), self._pipeline.chain.source, self._pipeline.chain.bands)
         height, width = frame.shape[:2]
         layers = _by_kind(np.ones((height, width)), np.zeros((height, width, 2)))
         meter, state = self._pipeline.meter(), State()

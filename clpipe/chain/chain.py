@@ -22,6 +22,7 @@ from clpipe.reference.random import Stream, stream_of
 from clpipe.reference.resample import Resampler, sizes
 from clpipe.stage import (
     Argument,
+    Bands,
     Context,
     Kind,
     Method,
@@ -105,6 +106,17 @@ class Chain:
         """The first and the last step, as text for people."""
         names = self.step_names
         return f"{names[0]}..{names[-1]}" if len(names) > 1 else "".join(names)
+
+    @cached_property
+    def bands(self) -> int:
+        """The number of bands of a spectral source; 0 for another source."""
+        access = [pass_.access for pass_ in self.steps[0].passes[:1]] if self.steps else []
+        return access[0].count if access and isinstance(access[0], Bands) else 0
+
+    @property
+    def source_channels(self) -> int:
+        """The number of samples in a pixel of the source."""
+        return self.bands or len(self.source.channels)
 
     @property
     def iso(self) -> float:

@@ -9,6 +9,7 @@ from clpipe.base.tracing import Traced, with_changes
 from clpipe.camera.lens import calibration_of
 from clpipe.camera.optics import IN_PIXELS, Optics
 from clpipe.camera.profile import Camera, load_camera
+from clpipe.camera.spectra import DEFAULT_ILLUMINANT, Sight, sight_of
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.exposures import check_exposures
 from clpipe.chain.families import chain_of_family
@@ -17,9 +18,12 @@ from clpipe.chain.keys import LENS, NOISE, RENDER, setting_error
 from clpipe.chain.methods import base_name, validation_errors
 from clpipe.chain.registry import all_stages, check_passes, stage_in, user_code_errors
 from clpipe.chain.settings import Settings
+from clpipe.chain.sites import with_enough_planes
+from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.geometry import Scaling
 from clpipe.stage import Context, Kind, LensMethod, Method, Stage, StageRole, Unchanged
 from clpipe.stages.projection import WideAngle
+from clpipe.stages.spectral_response import CameraResponse
 
 
 def make_chain(
@@ -84,6 +88,7 @@ def _build_chain(
     chain = Chain(tuple(steps[first:last]), source, camera, settings, tuple(names))
     check_exposures(chain)
     _check_curve(chain)
+    chain = with_enough_planes(chain)
     noiseless = NOISE in settings.skip and any(step.adds_noise for step in chain.steps)
     return chain.without_noise() if noiseless else chain
 
@@ -117,8 +122,19 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
     methods = {name: settings.method(name) for name in settings.step_names}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
-    light = illuminant_gains(methods, camera)
-    context = Context(camera, settings.iso, light=light, optics=optics, exposure_time=time)
+    sight, render = sight_of_render(settings, camera, methods), settings.render
+    context = Context(
+        camera,
+        settings.iso,
+        light=illuminant_gains(methods, camera, sight),
+        wavelengths=render.wavelengths,
+        illuminant=render.illuminant,
+        sight=sight,
+        optics=optics,
+        exposure_time=time,
+    )
+    if sight and render.wavelengths:
+        context = context.replace(array_ahead=_array_ahead(settings, methods, context))
     steps: list[Step] = []
     previous, takes_lens = "the input", not settings.named_lens
     wide_step = ""  # the step after which the picture is no longer in perspective
@@ -164,10 +180,41 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
     return steps
 
 
-def illuminant_gains(methods: Mapping[str, Method], camera: Camera) -> tuple[float, float]:
-    """Return the gains of red and blue that balance the light: the set ones, else the camera's."""
+def sight_of_render(
+    settings: Settings, camera: Camera, methods: Mapping[str, Method]
+) -> Sight | None:
+    """Return the camera's sight in the light of a render; None if spectra do not matter.
+
+    Raises:
+        RequestError: the camera has no sensitivities, or the light is unknown.
+    """
+    sees = isinstance(methods.get(stage_in(StageRole.SPECTRUM).name), CameraResponse)
+    if not (settings.render.illuminant or (settings.render.wavelengths and sees)):
+        return None
+    return sight_of(camera, settings.render.illuminant or DEFAULT_ILLUMINANT)
+
+
+def _array_ahead(
+    settings: Settings, methods: Mapping[str, Method], context: Context
+) -> FilterArray:
+    """Return the array of the first mosaic of a chain; without one, a Bayer pattern."""
+    stage = stage_in(StageRole.PATTERN)
+    if stage.name not in methods:
+        return context.filter_array
+    is_set = bool(settings.parameters.get(stage.name))
+    method = stage.method_at_step(methods[stage.name], is_set, context)
+    return method.next_context(context).filter_array
+
+
+def illuminant_gains(
+    methods: Mapping[str, Method], camera: Camera, sight: Sight | None
+) -> tuple[float, float]:
+    """Return the gains of red and blue that balance the light.
+
+    They are the set ones, else those of the camera's sight, else the camera's.
+    """
     method = methods.get(stage_in(StageRole.BALANCE_OF_LIGHT).name)
-    red, blue = camera.white_balance_gains
+    red, blue = sight.gains if sight else camera.white_balance_gains
     return getattr(method, "red_gain", None) or red, getattr(method, "blue_gain", None) or blue
 
 

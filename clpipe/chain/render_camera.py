@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from clpipe.camera.sensitivities import Wavelength
 from clpipe.reference.pose import rotation
 
 Length = Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
@@ -35,6 +37,12 @@ class RenderCamera(BaseModel):
     cy: Finite | None = None
     # The horizontal field of view in radians, as in transforms.json.
     camera_angle_x: Annotated[float, Field(gt=0, lt=math.pi)] | None = None
+    # The centres of the bands of a spectral render, nm. A file states its own.
+    wavelengths: Annotated[
+        tuple[Wavelength, ...], Field(strict=False, min_length=2, max_length=2000)
+    ] = ()
+    # The light of the scene, to which the camera is balanced. An RGB render is lit by it.
+    illuminant: Annotated[str, Field(max_length=4096)] = ""
     # From world to camera, in OpenCV's axes: x_cam = rotation x + translation.
     rotation: Matrix | None = None
     translation: Vector | None = None
@@ -47,6 +55,8 @@ class RenderCamera(BaseModel):
     def _check_pose(self) -> Self:
         if (self.rotation is None) != (self.translation is None):
             raise ValueError("only one of rotation and translation is set; set both or neither")
+        if any(a >= b for a, b in pairwise(self.wavelengths)):
+            raise ValueError("wavelengths must ascend")
         return self
 
     @property
@@ -72,4 +82,4 @@ class RenderCamera(BaseModel):
         return self.model_copy(update={k: v for k, v in shot.items() if k not in set_fields})
 
 
-POSE = {"rotation", "translation", "motion"}
+POSE = {"rotation", "translation", "motion", "wavelengths", "illuminant"}

@@ -78,8 +78,10 @@ def _load(
     if not launch.reads:
         kind, dtype = plan.source, "half" if plan.half else "float"
         builder.buffer("src", dtype, "src")
-        source = f"source_{kind.c_name}_{dtype}{'_planes' if plan.planar else ''}"
-        return [], lambda row: [first(f"{source}(src, at, e)", kind)], kind
+        layout = f"{dtype}{'_planes' if plan.planar else ''}"
+        source = f"{op.pass_.function if op else f'source_{kind.c_name}'}_{layout}"
+        values = ["src", "at", "e", *(builder.arguments(op) if op else ())]
+        return [], lambda row: [first(f"{source}({', '.join(values)})", kind)], kind
     images = [builder.image(read) for read in launch.reads]
     if not op:
         kind = launch.reads[0].image.kind

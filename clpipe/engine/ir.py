@@ -11,6 +11,7 @@ from clpipe.base.cache import cached_hash
 from clpipe.engine.bindings import Parameter
 from clpipe.engine.ops import Op
 from clpipe.reference.resample import Resampler, sizes
+from clpipe.stage import Bands as SourceBands
 from clpipe.stage import Kind, Pointwise, Resample, Stencil
 
 
@@ -68,8 +69,8 @@ class Launch:
 
     @property
     def opener(self) -> Op | None:
-        """The op that opens the group and reads images itself (stencil or resampling), or None."""
-        opens = self.ops and isinstance(self.ops[0].pass_.access, Stencil | Resample)
+        """The op that opens the group and reads images or bands itself, or None."""
+        opens = self.ops and isinstance(self.ops[0].pass_.access, Stencil | Resample | SourceBands)
         return self.ops[0] if opens else None
 
     @property
@@ -174,7 +175,7 @@ AnyLaunch = Launch | Lines | Histogram | Reduce | Finalize
 
 def unscaled(launch: AnyLaunch) -> AnyLaunch:
     """Return a launch without the scale of the resampling that opens it, if there is one."""
-    if not isinstance(launch, Launch) or not launch.opener or launch.stencil:
+    if not isinstance(launch, Launch) or not launch.opener or not launch.reads or launch.stencil:
         return launch
     bands = launch.bands
     if bands:
@@ -199,6 +200,7 @@ class Plan:
         source: the kind of the source.
         half: whether the source is float16, not float32.
         planar: whether the source is stored as consecutive planes, not interleaved.
+        bands: the bands of a spectral source; 0 for another source.
         launches: the launches, in order.
         slots: the slots of each image's planes, by the image's number.
         slot_count: the number of slots.
@@ -223,6 +225,12 @@ class Plan:
     border: int = 0
     states: tuple[tuple[str, Image | None, Image], ...] = ()
     resamplings: tuple[Resampler, ...] = ()
+    bands: int = 0
+
+    @property
+    def source_bytes(self) -> int:
+        """The bytes of a pixel of the source."""
+        return (self.bands or len(self.source.channels)) * (2 if self.half else 4)
 
     @cached_property
     def unscaled(self) -> "Plan":

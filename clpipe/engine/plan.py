@@ -28,6 +28,7 @@ from clpipe.engine.slots import assign_slots
 from clpipe.reference.resample import Resampler
 from clpipe.stage import (
     PREVIOUS,
+    Bands,
     Kind,
     LineTable,
     Pointwise,
@@ -172,7 +173,7 @@ class _Planner:
                 case Resample(resampler):
                     self.group = Launch("", (op,), (Read(self.close()),))
                     self.resamplings.append(resampler)
-                case Pointwise() | TableLookup():
+                case Pointwise() | TableLookup() | Bands():
                     if self.group is None:
                         assert self.stored is not None
                         self.group = Launch("", (), (Read(self.stored),))
@@ -268,4 +269,5 @@ def make_plan(
         border=border,
         states=tuple(states),
         resamplings=tuple(planner.resamplings),
+        bands=chain.bands,
     )

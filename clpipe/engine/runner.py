@@ -14,6 +14,7 @@ from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
+from clpipe.chain.sites import with_site_sums
 from clpipe.engine.buffers import HostImages, allocate_results, crop_patches, is_planar
 from clpipe.engine.device import Device
 from clpipe.engine.extents import Box, whole_image
@@ -112,7 +113,7 @@ class Runner:
         final: bool = False,
         bands: bool = True,
     ) -> None:
-        self.chain = chain
+        self.chain = with_site_sums(chain, tuple(keep))
         self.device = device
         self.keep = tuple(keep)
         self.encode = encode
@@ -159,7 +160,10 @@ class Runner:
     def plan_for(self, image: Array, frame: FrameKind = FrameKind.SINGLE) -> Plan:
         """Return the plan for an image."""
         size = image.shape[1::-1]
-        options = image.dtype == np.float16, min(self.chain.size(*size)) > 1, is_planar(image)
+        half = image.dtype == np.float16
+        # Half bands are read in planes.
+        planar = is_planar(image) or (half and self.chain.bands > 0)
+        options = half, min(self.chain.size(*size)) > 1, planar
         plan = self.plan(*options, frame=frame)
         return self.plan(*options, bands=False, frame=frame) if plan.is_tiny(*size) else plan
 
@@ -194,7 +198,8 @@ class Runner:
         assert self.device
         if not self.device.is_compiled(plan):
             width, height = self.chain.margins.image_size(8, 8)
-            shape = (height, width, 3)[: 2 if len(self.chain.source.channels) == 1 else 3]
+            channels = self.chain.source_channels
+            shape = (height, width, channels)[: 2 if channels == 1 else 3]
             tiny = np.zeros(shape, np.float16 if plan.half else np.float32)
             try:
                 plan.check_resamplings(width, height)
@@ -305,7 +310,7 @@ class Runner:
         Raises:
             ImageError: the image has another shape.
         """
-        channels = len(self.chain.source.channels)
+        channels = self.chain.source_channels
         shape = image.shape[2] if image.ndim == 3 else 1
         if image.ndim not in (2, 3) or shape != channels or 0 in image.shape:
             axes = "(height, width)" if channels == 1 else f"(height, width, {channels})"

@@ -35,7 +35,7 @@ def source_bytes(plan: Plan, extent: Extent) -> int:
     """Return the bytes of the source that kernels may read: whole blocks, even past its end."""
     stored = extent.stored
     pixels = (extent.padded_height - 1) * stored.width + extent.padded_width
-    return pixels * len(plan.source.channels) * (2 if plan.half else 4)
+    return pixels * plan.source_bytes
 
 
 def buffer_sizes(plan: Plan, extents: Extents, depth: int = 1) -> dict[str, int]:

@@ -18,7 +18,7 @@ def sum_bytes(lanes: int) -> float:
 
 def bytes_per_pixel(plan: Plan, lanes: int) -> float:
     """Return the device memory in bytes per pixel: source, slots, block sums, eight-bit result."""
-    total = float(len(plan.source.channels) * (2 if plan.half else 4))
+    total = float(plan.source_bytes)
     total += sum(4 * relative_pixels(plan, min(levels)) for levels in plan.levels_of_slots)
     for launch in plan.launches:
         if isinstance(launch, Launch) and launch.sums:
@@ -36,7 +36,7 @@ def launch_bytes(plan: Plan, launch: AnyLaunch, lanes: int) -> float:
     if not isinstance(launch, Launch):
         return total
     if not launch.reads:
-        total += len(plan.source.channels) * (2 if plan.half else 4)
+        total += plan.source_bytes
     written = 0.0
     if launch.writes:
         written += 4 * len(launch.writes.kind.channels)

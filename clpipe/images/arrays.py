@@ -9,6 +9,8 @@ from clpipe.base.errors import ImageError
 from clpipe.base.types import Array
 from clpipe.stage import Kind
 
+BLOCK = 1 << 24  # samples that are checked at a time
+
 
 def as_array(value: Any, what: str) -> Array:
     """Return a NumPy array that shares the memory of an array or DLPack tensor of any library.
@@ -39,18 +41,19 @@ def as_array(value: Any, what: str) -> Array:
         ) from None
 
 
-def as_image(value: Any, kind: Kind) -> Array:
+def as_image(value: Any, kind: Kind, bands: int = 0) -> Array:
     """Return an image in a type that a chain can start on: float16, float32 or whole DN.
 
     Args:
         value: an array or tensor, (height, width, 3), or (height, width) for a mosaic.
         kind: the kind of image that the chain starts on.
+        bands: the number of its bands if it is spectral, instead of 3.
 
     Raises:
         ImageError: the value has another type or shape, or is not finite; the message advises.
     """
     image = as_array(value, "image")
-    check_shape(image.shape, kind)
+    check_shape(image.shape, kind, bands)
     is_mosaic = len(kind.channels) == 1
     if kind is Kind.DISPLAY and image.dtype in (np.uint8, np.uint16):
         return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
@@ -67,7 +70,8 @@ def as_image(value: Any, kind: Kind) -> Array:
         )
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
-    if not np.isfinite(image).all():
+    step = max(1, BLOCK // max(image[0].size, 1))  # a cube may be larger than half of the memory
+    if not all(np.isfinite(image[i : i + step]).all() for i in range(0, len(image), step)):
         wrong = np.argwhere(~np.isfinite(image))
         names = ("row", "column", "channel")[: image.ndim]
         place = ", ".join(f"{name} {i}" for name, i in zip(names, wrong[0], strict=True))
@@ -78,18 +82,28 @@ def as_image(value: Any, kind: Kind) -> Array:
     return image
 
 
-def check_shape(shape: tuple[int, ...], kind: Kind) -> None:
+def check_shape(shape: tuple[int, ...], kind: Kind, bands: int = 0) -> None:
     """Check that an array has the shape of one image of a kind.
 
     Raises:
         ImageError: it has not; the message contains code that converts it.
     """
-    channels = len(kind.channels)
-    expected = "(height, width, 3)" if channels > 1 else "(height, width)"
-    if 0 not in shape and len(shape) == (3 if channels > 1 else 2) and shape[2:] in ((), (3,)):
+    channels = bands or len(kind.channels)
+    expected = f"(height, width, {channels})" if channels > 1 else "(height, width)"
+    if (
+        0 not in shape
+        and len(shape) == (3 if channels > 1 else 2)
+        and shape[2:]
+        in (
+            (),
+            (channels,),
+        )
+    ):
         return
     advice = ""
-    if channels == 1 and len(shape) == 3 and 1 in (shape[0], shape[2]):
+    if bands:
+        advice = f"The last axis has the {bands} bands of render.wavelengths"
+    elif channels == 1 and len(shape) == 3 and 1 in (shape[0], shape[2]):
         advice = f"Pass {'image[0]' if shape[0] == 1 else 'image[..., 0]'}"
     elif channels == 1 and len(shape) == 3 and shape[2] == 3:
         advice = "To process colours, start the chain at mosaic or before it"

@@ -77,6 +77,7 @@ class FilterArray:
             green.
         is_balanced: whether white is 1 in all channels of the mosaic. Otherwise, its colours are
             the raw ones, and the light that a filter passes is added up.
+        whites: the raw signal of each channel for white, in any unit; () is that of ideal dyes.
 
     A camera exposes for the channel that saturates first. White at EV 0 fills this channel, and the
     others less, by :meth:`levels`. A clear pixel therefore saturates before its neighbours.
@@ -86,6 +87,7 @@ class FilterArray:
     rows: tuple[str, ...]
     gains: tuple[float, float] = (1.0, 1.0)
     is_balanced: bool = True
+    whites: tuple[float, ...] = ()
 
     @property
     def period(self) -> tuple[int, int]:
@@ -162,7 +164,9 @@ class FilterArray:
         >>> parse_array("x-trans", (2.0, 1.6)).levels
         {'R': 0.5, 'G': 1.0, 'B': 0.625}
         """
-        sums = {letter: float(self._raw(letter).sum()) for letter in self.channels}
+        sums = dict(zip(self.channels, self.whites, strict=False)) or {
+            letter: float(self._raw(letter).sum()) for letter in self.channels
+        }
         largest = max(sums.values())
         return {letter: value / largest for letter, value in sums.items()}
 

@@ -11,6 +11,7 @@ from clpipe.base.types import Floats
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.optics import Optics
 from clpipe.camera.profile import IDENTITY, Camera, Matrix
+from clpipe.camera.spectra import Sight
 from clpipe.reference.cfa import Pattern, red_site
 from clpipe.reference.companding import Knots
 from clpipe.reference.filter_array import FilterArray, parse_array
@@ -49,6 +50,13 @@ class Context:
     gains: tuple[float, float] = (1.0, 1.0)
     # Gains of red and blue that white_balance applies again.
     applied_gains: tuple[float, float] = (1.0, 1.0)
+    wavelengths: tuple[float, ...] = ()  # of the source's bands, nm; () is RGB
+    illuminant: str = ""  # the light of a render; "" is not stated, and means D65
+    sight: Sight | None = field(default=None, repr=False)  # the sensor in this light, if needed
+    # The array of the mosaic, for stages before it.
+    array_ahead: FilterArray = field(default_factory=lambda: parse_array("RGGB"))
+    # The channels of the image's three planes. "": each pixel has the light of its own filter.
+    planes: str = "RGB"
     exposure_time: float | None = None  # s; None if exposure does not state it
     headroom: float = 0.0  # stops by which exposure darkened the scene
     colours: Matrix = IDENTITY  # linear sRGB to the image's red, green and blue, white-balanced

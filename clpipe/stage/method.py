@@ -280,6 +280,7 @@ class StageRole(Enum):
     """Roles, by which the rest of clpipe finds stages, instead of by their names."""
 
     EXPOSURE = "its ev is changed by a bracket"
+    SPECTRUM = "it reads the bands of a spectral render"
     SHUTTER = "its subframes are files of one exposure"
     VIEW = "it makes images from a render of the whole surroundings"
     PATTERN = "its pattern is that of a raw input"

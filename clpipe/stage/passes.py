@@ -76,6 +76,20 @@ class Stencil:
 
 
 @dataclass(frozen=True)
+class Bands:
+    """Computes a pixel from all bands of a spectral source. Only a chain's first pass can.
+
+    The kernel file defines the function for each layout of the source, with these suffixes: _float
+    (interleaved), _float_planes and _half_planes.
+
+    Args:
+        count: the number of bands.
+    """
+
+    count: int
+
+
+@dataclass(frozen=True)
 class Resample:
     """Computes a pixel of a resized or warped image from pixels of the image.
 
@@ -112,7 +126,7 @@ class Reduction:
     bins: int = 0
 
 
-Access = Pointwise | TableLookup | Stencil | Resample | LineTable | Reduction
+Access = Pointwise | TableLookup | Stencil | Bands | Resample | LineTable | Reduction
 
 
 # What a stage with state calls its result for the frame before, see :class:`Pass`.

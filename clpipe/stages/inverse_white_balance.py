@@ -30,7 +30,8 @@ class Gains(CameraGains):
         return 1 / red, 1 / blue
 
     def resolve(self, context: Context) -> CameraGains:
-        resolved = super().resolve(context)
+        red, blue = context.illuminant_gains
+        resolved = self.with_defaults(red_gain=red, blue_gain=blue)
         return ArrayGains.for_array(context.array, resolved) if context.array else resolved
 
     def next_context(self, context: Context) -> Context:

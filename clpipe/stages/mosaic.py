@@ -1,5 +1,6 @@
 """The colour filter array."""
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar
 
@@ -105,7 +106,10 @@ class AnyArray(Method):
         return self
 
     def _parsed(self, context: Context) -> FilterArray:
-        return parse_array(self.array).with_gains(context.illuminant_gains)
+        array = parse_array(self.array).with_gains(context.illuminant_gains)
+        if context.planes == "RGB" or context.sight is None:
+            return array
+        return replace(array, whites=tuple(map(context.sight.white, array.channels)))
 
     def next_context(self, context: Context) -> Context:
         return context.with_array(self._parsed(context))
@@ -115,24 +119,33 @@ class AnyArray(Method):
 
     def arguments(self, context: Context) -> Arguments:
         array = self._parsed(context)
-        return {"responses": responses_table(array), **period_of(array.period)}
+        return {"responses": responses_table(array, context.planes), **period_of(array.period)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
-        table = responses_of(self._parsed(inputs.context))
+        table = responses_of(self._parsed(inputs.context), inputs.context.planes)
         red, green, blue = (tiled(table[:, c], image.shape) for c in range(3))
         return (image[..., 0] * red + image[..., 1] * green) + image[..., 2] * blue
 
 
-def responses_of(array: FilterArray) -> Floats:
-    """Return the transmission of the filter at each position: (row, colour, column)."""
-    colours = [{k: float(v[c]) for k, v in array.responses.items()} for c in range(3)]
+def responses_of(array: FilterArray, planes: str = "RGB") -> Floats:
+    """Return the transmission of the filter at each position: (row, plane, column).
+
+    Args:
+        array: the filter array.
+        planes: the channels of the image's planes; see :class:`~clpipe.stage.Context`.
+    """
+    responses = {k: [float(x) for x in v] for k, v in array.responses.items()}
+    if planes != "RGB":
+        own = {k: max(planes.find(k), 0) for k in responses}
+        responses = {k: [float(c == place) for c in range(3)] for k, place in own.items()}
+    colours = [{k: v[c] for k, v in responses.items()} for c in range(3)]
     return np.stack([array.by_position(each) for each in colours], axis=1)
 
 
 @lru_cache(maxsize=64)  # equal arrays share one object, so that it is uploaded once
-def responses_table(array: FilterArray) -> Floats:
+def responses_table(array: FilterArray, planes: str) -> Floats:
     """Return :func:`responses_of` an array in the layout of kernels."""
-    return kernel_table(responses_of(array))
+    return kernel_table(responses_of(array, planes))
 
 
 def _camera_default(context: Context) -> Method | None:

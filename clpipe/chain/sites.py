@@ -1,0 +1,68 @@
+"""Spectral renders whose pixels have only the sums that a mosaic needs."""
+
+from dataclasses import replace
+
+from clpipe.base.errors import KeyedError
+from clpipe.chain.chain import Chain, Step
+from clpipe.stage import Pointwise, StageRole
+from clpipe.stages.spectral_response import CameraResponse
+
+
+def steps_to_mosaic(chain: Chain) -> tuple[Step, ...] | None:
+    """Return the steps from the spectral response to the mosaic, without both; None without them.
+
+    The chain begins with the spectral response of the camera.
+    """
+    roles = [step.stage.role for step in chain.steps]
+    if not chain.bands or StageRole.PATTERN not in roles:
+        return None
+    if not isinstance(chain.steps[0].method, CameraResponse):
+        return None
+    return chain.steps[1 : roles.index(StageRole.PATTERN)]
+
+
+def _is_by_pixel(step: Step) -> bool:
+    """Return whether a step scales all colours of a pixel alike, without regard to others."""
+    scales = step.stage.role in (StageRole.EXPOSURE, StageRole.FALLOFF)
+    return not step.passes or (
+        scales and all(isinstance(each.access, Pointwise) for each in step.passes)
+    )
+
+
+def with_site_sums(chain: Chain, keep: tuple[str, ...] = ()) -> Chain:
+    """Return the chain with only the sum for each pixel that its site in the mosaic needs.
+
+    The mosaic is the same. The chain itself is returned if a step mixes pixels or colours before
+    the mosaic, or if an image before it is kept.
+    """
+    between = steps_to_mosaic(chain)
+    if between is None or not all(map(_is_by_pixel, between)):
+        return chain
+    first = chain.steps[0]
+    if {first.name, *(step.name for step in between)} & {*keep}:
+        return chain
+    method = first.method
+    assert isinstance(method, CameraResponse)
+    found = chain.with_methods({first.name: method.at_sites(first.context.array_ahead)})
+    return replace(found, names=chain.names)
+
+
+def with_enough_planes(chain: Chain) -> Chain:
+    """Return the chain with one sum for each site if the filter array has too many channels.
+
+    Raises:
+        KeyedError: a step before the mosaic needs all channels of a pixel.
+    """
+    between = steps_to_mosaic(chain)
+    if between is None or chain.steps[1].context.planes:
+        return chain
+    for step in between:
+        if not _is_by_pixel(step):
+            array = chain.steps[0].context.array_ahead
+            raise KeyedError(
+                step.name,
+                f"{step.name}.method={step.method.method}: this step before the mosaic needs all "
+                f"channels of a pixel, but of a spectral render at most three are computed, and "
+                f"{array.name} has {', '.join(array.channels)}; skip {step.name}",
+            )
+    return with_site_sums(chain)
