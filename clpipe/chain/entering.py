@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.keys import RENDER
@@ -13,12 +14,15 @@ from clpipe.chain.layers import layer_steps, layer_warnings, reads_layers, with_
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.panorama import with_panorama
+from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import overlay
 from clpipe.chain.void import black_area_warning
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
-from clpipe.stage import ImageLayer
+from clpipe.stage import ImageLayer, StageRole
 from clpipe.stage.method import parameters_with
+
+MISSED = 0.01  # share of a channel's white outside of the bands, above which there is a warning
 
 
 @dataclass(frozen=True)
@@ -75,12 +79,55 @@ def prepare_image(
     elif margins:
         chain = with_overscan(chain, margins)
     height, width = pixels.shape[:2]
-    warnings = tuple(filter(None, [black_area_warning(chain, width, height)]))
+    texts = black_area_warning(chain, width, height), bands_warning(chain)
+    warnings = tuple(filter(None, texts))
     if layer is None or pixels.ndim != 3 or not reads_layers(chain):
         return PreparedImage(chain, pixels, margins, warnings=warnings)
     layers = {step: layer(chain, step, width, height, margins) for step in layer_steps(chain)}
     warnings += tuple(layer_warnings(chain, layers))
     return PreparedImage(with_layers(chain, layers), pixels, margins, layers, warnings)
+
+
+@lru_cache(maxsize=64)
+def with_bands(chain: Chain, wavelengths: tuple[float, ...]) -> Chain:
+    """Return the chain for an image with bands of these wavelengths, nm; () is an image in RGB.
+
+    Raises:
+        RequestError: the chain does not start with spectra, or its settings state other bands.
+    """
+    stated, first = chain.settings.render.wavelengths, chain.steps[0]
+    if wavelengths == stated:
+        return chain
+    if not wavelengths or stated:
+        found = f"{len(wavelengths)} bands" if wavelengths else "red, green and blue"
+        raise RequestError(
+            f"render.wavelengths: found {len(stated)} wavelengths, but the image has {found}, and "
+            "states their wavelengths itself; remove render.wavelengths"
+        )
+    if first.stage.role is not StageRole.SPECTRUM:
+        name = stage_in(StageRole.SPECTRUM).name
+        raise RequestError(
+            f"{first.name}: the image has {len(wavelengths)} spectral bands, but the chain starts "
+            f"at {first.name}; list {name} before it, or read red, green and blue with --layer RGB"
+        )
+    settings = overlay(chain.settings, {RENDER: {"wavelengths": wavelengths}})
+    return make_chain(settings, chain.source, until=chain.steps[-1].name)
+
+
+def bands_warning(chain: Chain) -> str:
+    """Return a warning if the bands of a render miss light that the sensor sees; "" if not."""
+    context = chain.steps[0].context
+    if not chain.bands or context.sight is None:
+        return ""
+    array, nm = context.array_ahead, context.wavelengths
+    missed = {channel: context.sight.missed(nm, channel) for channel in array.channels}
+    worst = max(missed, key=lambda channel: missed[channel])
+    if missed[worst] < MISSED:
+        return ""
+    return (
+        f"its bands from {nm[0]:g} to {nm[-1]:g} nm miss {missed[worst]:.1%} of what {worst} sees "
+        "of white; render more bands"
+    )
 
 
 @lru_cache(maxsize=64)

@@ -8,10 +8,11 @@ from clpipe.base.errors import ImageError
 from clpipe.images.clip_frames import clip_of, clip_size
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
 from clpipe.images.colour_names import space_of
-from clpipe.images.layers import picture_channels
+from clpipe.images.layers import is_spectral, picture_channels
 from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
 from clpipe.images.raw import RAW_SUFFIXES, raw_size
+from clpipe.images.spectral import spectra_in
 
 FLOAT = 4  # bytes per float
 
@@ -69,12 +70,13 @@ def display_size(path: Path) -> tuple[int, int]:
         return spec.full_width, spec.full_height
 
 
-def claim_of(path: Path, mosaic: bool = False) -> MemoryClaim | None:
+def claim_of(path: Path, mosaic: bool = False, layer: str | None = None) -> MemoryClaim | None:
     """Return the claim of a file; None if it cannot be opened.
 
     Args:
         path: the file.
         mosaic: whether only a single channel is read.
+        layer: the layer to read, which may be :data:`clpipe.images.spectral.SPECTRAL`.
     """
     try:
         if clip := clip_of(path):
@@ -84,18 +86,21 @@ def claim_of(path: Path, mosaic: bool = False) -> MemoryClaim | None:
         if path.suffix.lower() in RAW_SUFFIXES:
             return mosaic_claim(*raw_size(path))
         with open_image(path) as file:
-            return _claim(file.spec(), file.format_name() == "openexr", mosaic)
+            return _claim(file.spec(), file.format_name() == "openexr", mosaic, layer)
     except ImageError:
         return None
 
 
-def _claim(spec: Any, is_exr: bool, mosaic: bool) -> MemoryClaim:
+def _claim(spec: Any, is_exr: bool, mosaic: bool, layer: str | None) -> MemoryClaim:
     width, height = max(spec.width, spec.full_width), max(spec.height, spec.full_height)
     formats = spec.channelformats or [spec.format] * spec.nchannels
     picture = None if mosaic else picture_channels(list(spec.channelnames))
+    spectra = [] if mosaic else spectra_in(spec.channelnames)
+    if spectra and is_spectral(layer, {0: spectra}, picture is not None):
+        picture = spectra[0].layer, spectra[0].channels
     picture_formats = [formats[i] for i in picture[1]] if picture else formats
     sample = 2 if is_exr and all(each.size() == 2 for each in picture_formats) else FLOAT
-    image = sample * (1 if mosaic else 3)
+    image = sample * (1 if mosaic else len(picture[1]) if picture else 3)
     stored = sum(each.size() for each in formats)
     # The package OpenEXR decodes all channels, from which the requested ones are copied.
     extra = 0 if stored == image else min(stored, MAX_EXTRA * image)

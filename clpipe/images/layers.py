@@ -1,7 +1,7 @@
 """Finds the picture of a file among its parts, layers and channels."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from clpipe.base.text import printable
 from clpipe.images.attributes import clpipe_attributes
 from clpipe.images.kinds import is_aov
 from clpipe.images.openimageio import MAX_PARTS, parts_of
-from clpipe.images.spectral import spectra_in
+from clpipe.images.spectral import SPECTRAL, Spectrum, light_in, spectra_in
 
 # Names of layers that hold the finished picture, in order of preference, in lower-case letters. The
 # first are channels R, G and B without a layer: Nuke, Arnold, V-Ray, Mitsuba, Octane, Unreal.
@@ -50,6 +50,7 @@ class PictureLocation:
         xyz: whether the channels are X, Y and Z.
         view: the number of the view in a stereo picture.
         name: the name of the layer, without the view's name.
+        wavelengths: of the bands of a spectral picture, nm; its channels are these bands.
     """
 
     part: int
@@ -58,6 +59,7 @@ class PictureLocation:
     xyz: bool = False
     view: int = 0
     name: str = ""
+    wavelengths: tuple[float, ...] = ()
 
     @property
     def rank(self) -> tuple[bool, int, int]:
@@ -93,6 +95,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     channel_names: list[str] = []
     rejections: list[str] = []
     views: list[str] = []
+    spectra: dict[int, list[Spectrum]] = {}  # by part
     for part, part_name, spec in parts_of(file):
         if part >= MAX_PARTS:
             raise ImageError(
@@ -106,6 +109,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         is_kept = "kind" in clpipe_attributes(spec)
         views += stated_views(spec)
         channel = mosaic_channel(names) if mosaic else None
+        if not mosaic and (found_spectra := spectra_in(names)):
+            spectra[part] = found_spectra
         found = [] if mosaic else list(_layers(names, is_kept))
         if is_kept and not (found or channel):
             raise KindError(path, clpipe_attributes(spec))
@@ -118,10 +123,13 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
                 pictures.append(PictureLocation(part, full, channels, xyz, view, name))
     if not pictures and rejections:
         raise ImageError(f"{path}: {rejections[0]}")
-    if not pictures and (spectra := spectra_in(channel_names)) and not mosaic:
-        raise NoPictureError(
-            f"{path}: there are no R, G and B channels, but {' and '.join(map(str, spectra))}",
-            "clpipe reads RGB only, so let the renderer write R, G and B as well",
+    if spectra and is_spectral(layer, spectra, bool(pictures)):
+        part, layers = next(iter(spectra.items()))
+        light = light_in(path, layers, layer)
+        file.seek_subimage(part, 0)
+        file.geterror()
+        return PictureLocation(
+            part, light.layer, light.channels, name=light.layer, wavelengths=light.wavelengths
         )
     if not pictures:
         listed = ", ".join(name for name in channel_names[:20] if name) or "none"
@@ -132,6 +140,16 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears the error: the loop asked for levels that do not exist
     return best
+
+
+def is_spectral(
+    layer: str | None, spectra: Mapping[int, Sequence[Spectrum]], has_picture: bool
+) -> bool:
+    """Return whether the bands of a file are read, not its R, G and B."""
+    if layer is None:
+        return not has_picture
+    named = {each.layer.lower() for layers in spectra.values() for each in layers}
+    return layer.lower() in named - {""} | {SPECTRAL}
 
 
 def stated_views(spec: Any) -> list[str]:
@@ -205,7 +223,9 @@ def _picture_in_layer(path: Path, pictures: list[PictureLocation], layer: str) -
     Raises:
         ImageError: there is none.
     """
-    named = next((each for each in pictures if each.layer.lower() == layer.lower()), None)
+    names = [layer.lower(), *([""] if layer.lower() == "rgb" else [])]
+    found = (each for name in names for each in pictures if each.layer.lower() == name)
+    named = next(found, None)
     if not named:
         listed = ", ".join(dict.fromkeys(p.layer or "one without a name" for p in pictures))
         raise ImageError(

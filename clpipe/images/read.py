@@ -60,6 +60,7 @@ class SourceImage:
         envmap: OpenImageIO's name of the environment map that the file states; otherwise "".
         panorama: the panorama, if ``pixels`` is an atlas of several views.
         part: the number of the layer's part in the file, from 0.
+        wavelengths: of the bands of a spectral render, nm; ``pixels`` then has a channel for each.
     """
 
     pixels: Array
@@ -75,6 +76,7 @@ class SourceImage:
     envmap: str = ""
     panorama: Panorama | None = None
     part: int = 0
+    wavelengths: tuple[float, ...] = ()
 
 
 def read_image(
@@ -86,11 +88,12 @@ def read_image(
 ) -> SourceImage:
     """Read the picture of a file as linear sRGB, in its display window, with finite samples.
 
-    The picture is the channels R, G and B. Without them it is X, Y and Z, or luminance, which
-    becomes grey. Primaries other than sRGB's are converted, and the orientation is applied.
-    Straight alpha multiplies the light, which composites the picture over black. Half samples stay
-    half unless they are converted. NaN becomes 0 and infinity 65504, with a warning. Pixels outside
-    the data window are black. Warnings list what the file states but clpipe does not apply.
+    The picture is the channels R, G and B. Without them it is X, Y and Z, or spectral bands, or
+    luminance, which becomes grey. Bands stay as they are. Primaries other than sRGB's are
+    converted, and the orientation is applied. Straight alpha multiplies the light, which composites
+    the picture over black. Half samples stay half unless they are converted. NaN becomes 0 and
+    infinity 65504, with a warning. Pixels outside the data window are black. Warnings list what the
+    file states but clpipe does not apply.
 
     Args:
         path: the file.
@@ -121,7 +124,7 @@ def read_image(
     if pixels.ndim == 2 and not mosaic:
         pixels = np.stack([pixels] * 3, axis=-1)
         warnings.append(GREY)
-    elif not mosaic:
+    elif not mosaic and not image.wavelengths:
         pixels, notes = _to_srgb(path, pixels, stated)
         warnings += notes
     # Values above the largest half are so bright that clipping loses nothing. Their squares could
@@ -352,7 +355,7 @@ def _decode(
                 f"{spec.full_y}; crop the render inside its frame"
             )
         margins = overscan_margins(x, y, data, display) if overscan else NO_MARGINS
-        stated = read_statements(path, file, location.xyz)
+        stated = read_statements(path, file, location.xyz, bool(location.wavelengths))
         pixels, digest = with_digest(
             path, lambda: read_part(path, file, location, mosaic, max_pixels, margins)
         )
@@ -367,6 +370,7 @@ def _decode(
             margins=margins,
             envmap=str(spec.getattribute("textureformat") or ""),
             part=location.part,
+            wavelengths=location.wavelengths,
         )
         return image, stated
 

@@ -3,16 +3,27 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from clpipe.base.errors import ImageError
+from clpipe.base.text import printable
 
 LEAST = 4  # bands of a spectrum; fewer channels named like wavelengths may be something else
 LIGHT_SPEED = 299_792_458.0  # m/s
 FACTORS = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}
-# A wavelength or frequency with a unit: S0.550,00nm of Fichet et al. (JCGT 10(3), 2021) and pbrt,
-# 550nm, or band.550.5nm. The decimal sign is a comma or a point.
+# A wavelength or frequency: S0.550,00nm of Fichet et al. (JCGT 10(3), 2021) and pbrt, 550nm,
+# band_550nm as named for Mitsuba's specfilm, or 550. The decimal sign is a comma or a point.
 NAME = re.compile(
-    r"(?:(?P<layer>\w*[A-Za-z]\w*(?:\.\w*[A-Za-z]\w*)*)\.)?"
-    r"(?P<number>\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)(?P<prefix>[numkMGT]?)(?P<unit>m|Hz)"
+    r"(?:(?P<layer>\w*[A-Za-z]\w*(?:\.\w*[A-Za-z]\w*)*)\.)?(?:[A-Za-z]+_)?"
+    r"(?P<number>\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)(?:(?P<prefix>[numkMGT]?)(?P<unit>m|Hz))?"
 )
+WITHOUT_UNIT = (300, 1100)  # nm; the range of plain numbers that are wavelengths
+SPECTRAL = "spectral"  # the name by which --layer selects the bands
+STOKES = ("S1", "S2", "S3")  # layers of polarised light (Fichet et al.)
+REFLECTIVE = "T"  # the layer of reflectances
+OF_SPECTRA = ("EV", "lensTransmission", "cameraResponse")  # attributes (Fichet et al.)
 
 
 @dataclass(frozen=True)
@@ -49,7 +60,11 @@ def spectra_in(names: Sequence[str]) -> list[Spectrum]:
     bands: dict[str, list[tuple[float, int]]] = {}
     for channel, name in enumerate(names):
         if match := NAME.fullmatch(name):
-            value = float(match["number"].replace(",", ".")) * FACTORS[match["prefix"]]
+            value = float(match["number"].replace(",", ".")) * FACTORS[match["prefix"] or ""]
+            if not match["unit"]:
+                if not WITHOUT_UNIT[0] <= value <= WITHOUT_UNIT[1]:
+                    continue
+                value *= 1e-9
             metres = LIGHT_SPEED / value if match["unit"] == "Hz" and value else value
             bands.setdefault(match["layer"] or "", []).append((round(metres * 1e9, 6), channel))
     ordered = {layer: sorted(found) for layer, found in bands.items() if len(found) >= LEAST}
@@ -57,3 +72,67 @@ def spectra_in(names: Sequence[str]) -> list[Spectrum]:
         Spectrum(layer, *map(tuple, zip(*found, strict=True)))
         for layer, found in sorted(ordered.items())
     ]
+
+
+def spectral_warnings(spec: Any, spectral: bool) -> list[str]:
+    """Return warnings about the spectral part of a file.
+
+    Args:
+        spec: the ``oiio.ImageSpec``.
+        spectral: whether the bands are read, not R, G and B.
+    """
+    if not spectral:
+        return [
+            f"its {each} are not used; its R, G and B were read. To read the bands, add --layer "
+            f"{SPECTRAL}"
+            for each in spectra_in(spec.channelnames)
+        ]
+    stated = {name: spec.getattribute(name) for name in OF_SPECTRA}
+    warnings = [
+        f"its {name}, {printable(str(value))[:60]}, is not applied; the camera's profile is used"
+        for name, value in stated.items()
+        if value is not None
+    ]
+    if "Mitsuba" in str(spec.getattribute("generatedBy") or ""):
+        warnings.append(
+            "its bands are read as radiance per nm; the response of each band of Mitsuba's "
+            "specfilm must therefore have the integral 1"
+        )
+    return warnings
+
+
+def light_in(path: Path, spectra: Sequence[Spectrum], layer: str | None = None) -> Spectrum:
+    """Return the spectrum of the light among those of a file.
+
+    Args:
+        path: the file, for messages.
+        spectra: its spectra, at least one.
+        layer: the name of a layer; None or :data:`SPECTRAL` chooses.
+
+    Raises:
+        ImageError: no spectrum is light, several may be it, or two bands are the same.
+    """
+    named = {each.layer: each for each in spectra}
+    chosen = layer is not None and layer.lower() != SPECTRAL
+    emitted = [each for name, each in named.items() if name not in (*STOKES, REFLECTIVE)]
+    if chosen:
+        emitted = [each for each in spectra if each.layer.lower() == str(layer).lower()]
+    if not emitted or (chosen and emitted[0].layer == REFLECTIVE):
+        raise ImageError(
+            f"{path}: its {spectra[0]} are reflectances or parts of polarised light, not the light "
+            "that reaches a camera. Render the scene under a light, and write the layer S0"
+        )
+    if not chosen and (polarised := [name for name in STOKES if name in named]):
+        raise ImageError(
+            f"{path}: this light is polarised (layers {', '.join(polarised)}), but clpipe's "
+            "filters are not. To use only its intensity, add --layer S0"
+        )
+    if len(emitted) > 1:
+        raise ImageError(
+            f"{path}: {len(emitted)} layers hold spectral bands: {', '.join(map(str, emitted))}. "
+            f"Name one with --layer, such as {emitted[0].layer or emitted[1].layer}"
+        )
+    found = emitted[0]
+    if repeated := [nm for nm, after in pairwise(found.wavelengths) if after <= nm]:
+        raise ImageError(f"{path}: two of its channels are the band of {repeated[0]:g} nm")
+    return found

@@ -17,7 +17,7 @@ from clpipe.images.colour import CIE_XYZ
 from clpipe.images.colour_names import ColourSpace, space_of
 from clpipe.images.openimageio import radiance_header
 from clpipe.images.pixels import convert_by_rows
-from clpipe.images.spectral import spectra_in
+from clpipe.images.spectral import spectral_warnings
 from clpipe.images.tags import FLIPS, upright
 from clpipe.images.vocabularies import vocabulary_warnings
 
@@ -69,20 +69,20 @@ class Statements:
         return pixels if self.orientation == 1 else upright(pixels, self.orientation)
 
 
-def read_statements(path: Path, file: Any, xyz: bool = False) -> Statements:
+def read_statements(path: Path, file: Any, xyz: bool = False, spectral: bool = False) -> Statements:
     """Return what a file states about the samples of its current part.
 
     Args:
         path: the file.
         file: the open ``oiio.ImageInput``.
         xyz: whether the channels are X, Y and Z.
+        spectral: whether the channels are spectral bands.
 
     Raises:
         ImageError: the file cannot be read.
     """
     spec, format_ = file.spec(), file.format_name()
-    bands = map(str, spectra_in(spec.channelnames))
-    warnings = [f"its {each} are not used; its R, G and B were read" for each in bands]
+    warnings = spectral_warnings(spec, spectral)
     aspect = spec.getattribute("PixelAspectRatio")
     header = radiance_header(path) if format_ == "hdr" else None
     if header:

@@ -13,7 +13,7 @@ from clpipe.base.errors import ImageError, KindError, NoPictureError, RequestErr
 from clpipe.base.reading import check_unchanged
 from clpipe.base.urls import listed_stamps, may_be_url
 from clpipe.chain.chain import Chain
-from clpipe.chain.entering import prepare_image
+from clpipe.chain.entering import prepare_image, with_bands
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.identity import image_key
 from clpipe.chain.isos import check_cameras
@@ -209,7 +209,7 @@ class ImageLoader:
             claim = mosaic_claim(dump.width, dump.height)
         else:
             mosaic = len(self.reads.channels) == 1
-            found = claim_of(job.path, mosaic)
+            found = claim_of(job.path, mosaic, self.request.layer)
             is_here = not may_be_url(job.path) or job.path.exists()
             known = [stamp_of(job.path)] if is_here else [*listed_stamps([job.path]).values()]
             size = known[0][0] if known else 0
@@ -312,7 +312,8 @@ class ImageLoader:
 
         around = source.panorama
         entry_ = prepare_image(
-            loaded.chain, source.pixels, source.margins, layer, source.shot, around
+            with_bands(loaded.chain, source.wavelengths),
+            *(source.pixels, source.margins, layer, source.shot, around),
         )
         if entry_.pixels is source.pixels and not (
             entry_.margins or entry_.layers or entry_.warnings
