@@ -7,8 +7,8 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
+from clpipe.camera.colorimetry import BRADFORD
 from clpipe.camera.profile import SRGB_TO_XYZ
-from clpipe.images.colour import BRADFORD
 from clpipe.images.raw import Exif, read_raw, read_raw_info
 from clpipe.images.read import read_image
 from clpipe.images.tags import upright

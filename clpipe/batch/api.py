@@ -154,8 +154,9 @@ def run(
             the clean mosaic (mosaic), its noise variance (variance), or the clean picture with
             uniform (iid) or intensity-dependent (intensity) noise. The noise of iid and intensity
             is independent and as strong as the picture's. These two also write the ground truth
-            from which they are made. The choices are "development", "clean", "mosaic", "variance",
-            "iid", "intensity".
+            from which they are made. For a spectral render, also the light that reaches the sensor,
+            in CIE XYZ (xyz) or linear sRGB (linear_srgb). The choices are "development", "clean",
+            "mosaic", "variance", "xyz", "linear_srgb", "iid", "intensity".
         truth_at: the moment of an exposure of several files whose pose and layers are written with
             the picture. Use all to write also the layers of its start and end. Use rows to take
             each row of the layers from the file in the middle of the row's exposure. The choices

@@ -18,7 +18,7 @@ from clpipe.batch.outcome import Outcome
 from clpipe.batch.tars import STAGING
 from clpipe.chain.formats import CLIP_FORMATS
 from clpipe.chain.options import Gaps
-from clpipe.chain.rendition import FLOAT_MOSAICS, Rendition
+from clpipe.chain.rendition import FLOATS, Rendition
 from clpipe.images.video import VideoOptions
 from clpipe.images.video_reading import VIDEO_SUFFIXES
 from clpipe.inputs.find import Job
@@ -185,7 +185,7 @@ def take_clip_options(options: dict[str, Any]) -> ClipOptions | None:
                 f"--{name}: a clip contains only pictures; remove this option, or write pictures "
                 "to a directory, with --sequence"
             )
-    if mosaics := [name for name in options.get("truth", ()) if name in FLOAT_MOSAICS]:
+    if mosaics := [name for name in options.get("truth", ()) if name in FLOATS]:
         raise RequestError(
             f"--truth: found {mosaics[0]}, but a clip contains only pictures; remove it"
         )

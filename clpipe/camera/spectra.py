@@ -63,8 +63,8 @@ def light(name: str) -> Doubles:
 
     A is the formula of CIE 15:2018, D65, F11 and LED-B3 are its tables.
 
-    >>> round(float(light("A")[260] / light("A")[150]), 2)  # 560 nm over 450 nm
-    3.02
+    >>> round(float(light("A")[260] / light("A")[150]), 3)  # 560 nm over 450 nm
+    3.022
 
     Args:
         name: one of :data:`ILLUMINANTS`, or a CSV file with rows of wavelength (nm) and power.
@@ -76,8 +76,8 @@ def light(name: str) -> Doubles:
         return _named_light(name)
     if not name.endswith(".csv"):
         raise RequestError(
-            f"render.illuminant{unknown_name('light', name, ILLUMINANTS)}; or name a CSV file with "
-            "rows of wavelength (nm) and power"
+            f"render.illuminant: {unknown_name('light', name, ILLUMINANTS)}; or name a CSV file "
+            "with rows of wavelength (nm) and power"
         )
     try:
         return _light_of(read_text(local_path("render.illuminant", name)), name)
@@ -155,8 +155,8 @@ class Sight:
     White is a surface that reflects all of the light. A channel is the letter of a filter.
 
     >>> from clpipe.camera.profile import load_camera
-    >>> sight_of(load_camera("sony-a7r2"), "A").gains
-    (1.27..., 2.79...)
+    >>> [round(gain, 2) for gain in sight_of(load_camera("sony-a7r2"), "A").gains]
+    [1.65, 2.54]
 
     Args:
         sensitivities: of the sensor.
@@ -291,6 +291,7 @@ def sight_of(camera: Camera, illuminant: str) -> Sight:
         raise RequestError(
             f"camera {camera.name}: its profile has no spectral sensitivities, which spectra and "
             "render.illuminant need. 'clpipe cameras' lists the cameras that have them, and "
-            "'clpipe cameras import' adds them to a profile"
+            "'clpipe cameras import' adds them to a profile. To read a spectral render as one in "
+            "sRGB, set spectral_response.method=srgb"
         )
     return _sight(camera.sensitivities.model_dump_json(), spectrum.tobytes())

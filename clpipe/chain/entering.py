@@ -14,13 +14,13 @@ from clpipe.chain.layers import layer_steps, layer_warnings, reads_layers, with_
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.panorama import with_panorama
-from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import overlay
 from clpipe.chain.void import black_area_warning
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
 from clpipe.stage import ImageLayer, StageRole
 from clpipe.stage.method import parameters_with
+from clpipe.stages.exposure.radiometric import Radiometric
 
 MISSED = 0.01  # share of a channel's white outside of the bands, above which there is a warning
 
@@ -63,6 +63,7 @@ def prepare_image(
         ImageError: ``layer`` raises it.
         RequestError: the camera's values contradict each other, or a step cannot use its layer.
     """
+    check_radiance(chain)
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.frame_size(*pixels.shape[1::-1])
         optics = chain.optics
@@ -93,9 +94,9 @@ def with_bands(chain: Chain, wavelengths: tuple[float, ...]) -> Chain:
     """Return the chain for an image with bands of these wavelengths, nm; () is an image in RGB.
 
     Raises:
-        RequestError: the chain does not start with spectra, or its settings state other bands.
+        RequestError: the settings state other bands, or the chain starts at a later step.
     """
-    stated, first = chain.settings.render.wavelengths, chain.steps[0]
+    stated = chain.settings.render.wavelengths
     if wavelengths == stated:
         return chain
     if not wavelengths or stated:
@@ -104,14 +105,28 @@ def with_bands(chain: Chain, wavelengths: tuple[float, ...]) -> Chain:
             f"render.wavelengths: found {len(stated)} wavelengths, but the image has {found}, and "
             "states their wavelengths itself; remove render.wavelengths"
         )
-    if first.stage.role is not StageRole.SPECTRUM:
-        name = stage_in(StageRole.SPECTRUM).name
+    if chain.step_names[0] != chain.names[0]:
         raise RequestError(
-            f"{first.name}: the image has {len(wavelengths)} spectral bands, but the chain starts "
-            f"at {first.name}; list {name} before it, or read red, green and blue with --layer RGB"
+            f"--start-at {chain.step_names[0]}: the image has {len(wavelengths)} spectral bands, "
+            "with which a chain begins; remove --start-at, or add --layer RGB"
         )
     settings = overlay(chain.settings, {RENDER: {"wavelengths": wavelengths}})
     return make_chain(settings, chain.source, until=chain.steps[-1].name)
+
+
+def check_radiance(chain: Chain) -> None:
+    """Check that an exposure in W/(m2 sr nm) has spectra.
+
+    Raises:
+        RequestError: the image is in red, green and blue.
+    """
+    step = chain.step_in(StageRole.EXPOSURE)
+    if step and isinstance(step.method, Radiometric) and not chain.bands:
+        raise RequestError(
+            f"{step.name}.method={step.method.method}: this method needs spectral bands, but the "
+            "image is in red, green and blue. For a render in cd/m2, use photometric. To read a "
+            "file's bands, add --layer spectral"
+        )
 
 
 def bands_warning(chain: Chain) -> str:

@@ -139,7 +139,7 @@ class OpticalBlur(TypedDict, total=False):
     psf: Text
 
 class Exposure(TypedDict, total=False):
-    method: Draw | Literal["gain", "auto", "photometric"]
+    method: Draw | Literal["gain", "auto", "photometric", "radiometric"]
     ev: Number
     headroom: Number
     rule: Draw | Literal["log_average", "percentile"]
@@ -153,6 +153,8 @@ class Exposure(TypedDict, total=False):
     f_number: Number
     q: Number
     scale: Number
+    pixel_pitch: Number
+    quantum_efficiency: Number
 
 class Mosaic(TypedDict, total=False):
     method: Draw | Literal["bayer", "array"]
@@ -386,6 +388,9 @@ class RestoreHighlights(TypedDict, total=False):
     red_gain: Number
     blue_gain: Number
 
+class SpectralResponse(TypedDict, total=False):
+    method: Draw | Literal["camera", "xyz", "srgb"]
+
 class TemporalDenoise(TypedDict, total=False):
     method: Draw | Literal["recursive", "block_matching", "flow"]
     frames: Number
@@ -409,6 +414,8 @@ class RenderCamera(TypedDict, total=False):
     cx: Number
     cy: Number
     camera_angle_x: Number
+    wavelengths: Several
+    illuminant: Text
     rotation: Several
     translation: Several
     motion: Several
@@ -474,6 +481,7 @@ class Keywords(TypedDict, total=False):
     remosaic: Remosaic
     resize: Resize
     restore_highlights: RestoreHighlights
+    spectral_response: SpectralResponse
     temporal_denoise: TemporalDenoise
     output: Encoding
     render: RenderCamera

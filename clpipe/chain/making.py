@@ -109,7 +109,8 @@ def entry_kind(settings: Settings) -> Kind:
 def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """Return the steps of settings in order, each resolved in the context after the earlier steps.
 
-    A step that does nothing is skipped if its image kind does not fit.
+    A step that does nothing is skipped if its image kind does not fit. The first step of a spectral
+    render is the spectral response, whether or not the settings list it.
 
     Args:
         settings: all values that are set.
@@ -119,7 +120,7 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
     Raises:
         RequestError: the image kinds of two stages do not fit.
     """
-    methods = {name: settings.method(name) for name in settings.step_names}
+    methods = {name: settings.method(name) for name in step_names_of(settings)}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
     sight, render = sight_of_render(settings, camera, methods), settings.render
@@ -178,6 +179,14 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
         raise setting_error(_unused_lens(settings, methods))
     _check_pixels(steps)
     return steps
+
+
+def step_names_of(settings: Settings) -> tuple[str, ...]:
+    """Return the names of the steps; a spectral render has the spectral response before them."""
+    spectral = stage_in(StageRole.SPECTRUM).name
+    if not settings.render.wavelengths or spectral in (*settings.stages, *settings.skip):
+        return settings.step_names
+    return spectral, *settings.step_names
 
 
 def sight_of_render(

@@ -7,7 +7,7 @@ from typing import Any
 
 from clpipe.base.errors import RequestError
 from clpipe.base.url_text import local
-from clpipe.chain.keys import setting_error
+from clpipe.chain.keys import RENDER, setting_error
 from clpipe.chain.methods import base_name
 from clpipe.chain.registry import all_stages
 from clpipe.stage import Stage
@@ -26,6 +26,9 @@ def resolve_paths(folder: Path | None, values: Mapping[str, Any]) -> dict[str, A
         stage = all_stages().get(base_name(key))
         if key == "camera":
             resolved[key] = _joined(folder, key, value, only=".toml")
+        elif key == RENDER and isinstance(value, Mapping) and "illuminant" in value:
+            file = _joined(folder, f"{RENDER}.illuminant", value["illuminant"], only=".csv")
+            resolved[key] = {**value, "illuminant": file}
         elif isinstance(value, Mapping) and stage:
             files = file_parameters(stage)
             resolved[key] = {

@@ -15,14 +15,16 @@ from pydantic import FiniteFloat, TypeAdapter, ValidationError
 from clpipe.base.errors import RequestError
 from clpipe.chain.identity import MAX_FRAMES
 
-Role = Literal["noisy", "development", "clean", "mosaic", "variance", "iid", "intensity"]
+Truth = Literal["development", "clean", "mosaic", "variance", "xyz", "linear_srgb"]
+Role = Literal["noisy", Truth, "iid", "intensity"]
 
 NOISY, *_ = ROLES = get_args(Role)
-DEVELOPMENT, CLEAN, MOSAIC, VARIANCE = TRUTHS = ROLES[1:5]
-IID, INTENSITY = BASELINES = ROLES[5:]
+DEVELOPMENT, CLEAN, MOSAIC, VARIANCE, XYZ, LINEAR_SRGB = TRUTHS = get_args(Truth)
+IID, INTENSITY = BASELINES = ROLES[-2:]
 
-# Truths that look like the noisy picture, and truths that are always float mosaics.
-PICTURES, FLOAT_MOSAICS = TRUTHS[:2], TRUTHS[2:]
+# Truths that look like the noisy picture, the light before the sensor, truths that are always
+# written in floats.
+PICTURES, LIGHTS, FLOATS = TRUTHS[:2], TRUTHS[4:], TRUTHS[2:]
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from clpipe.chain.keys import KEYS, TABLES
 from clpipe.chain.making import make_chain
 from clpipe.chain.options import MAX_PATCHES, Moments
 from clpipe.chain.paths import resolve_paths
-from clpipe.chain.registry import code_files, load_stage_file
+from clpipe.chain.registry import code_files, load_stage_file, stage_in
 from clpipe.chain.rendition import BASELINES, MOSAIC
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.truth import noisy_mosaic
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
 
 DEFAULTS = Settings()
 
@@ -232,7 +232,8 @@ class Request(RecordedRequest):
             RequestError: the chain cannot be built, or the options name a stage that it lacks.
         """
         chain = make_chain(settings, start_at=start_at, until=self.until)
-        known = (*chain.names, *self.image.get("skip", ()), *TABLES)
+        spectral = stage_in(StageRole.SPECTRUM).name  # in chains of spectral images
+        known = (*chain.names, *self.image.get("skip", ()), *TABLES, spectral)
         for step, value in self.options.items():
             # The table of a key is a draw.
             is_table = isinstance(value, Mapping) and step not in KEYS

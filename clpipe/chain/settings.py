@@ -185,6 +185,7 @@ class Settings(PlainSettings):
     def files(self) -> list[str]:
         """Return the files that the settings name. Their contents are part of the settings."""
         files = [self.camera] if self.camera.endswith(".toml") else []
+        files += [self.render.illuminant] if self.render.illuminant.endswith(".csv") else []
         for step, table in self.parameters.items():
             for name in sorted(file_parameters(stage_of(step))):
                 if isinstance(value := table.get(name), str) and value:

@@ -10,8 +10,9 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.registry import user_code_errors
-from clpipe.chain.rendition import CLEAN
-from clpipe.stage import Kind, ReferenceContext
+from clpipe.chain.rendition import CLEAN, XYZ
+from clpipe.stage import Kind, ReferenceContext, StageRole
+from clpipe.stages.spectral_response import ToSrgb, ToXyz
 
 
 def picture_without_noise(truth: str, chain: Chain) -> Chain:
@@ -27,6 +28,28 @@ def picture_without_noise(truth: str, chain: Chain) -> Chain:
     if truth == CLEAN and any(step.adds_noise for step in chain.steps):
         return chain.without_noise_or_denoising()
     return chain.without_noise()
+
+
+def light_of(truth: str, chain: Chain) -> Chain:
+    """Return the chain of the light that reaches the sensor, through the lens.
+
+    "xyz" is in CIE XYZ, and "linear_srgb" in linear sRGB. Both are in units of the render.
+
+    Raises:
+        RequestError: the image has no spectral bands, or the chain does not read them.
+    """
+    if not chain.bands:
+        raise RequestError(
+            f"--truth {truth}: this truth needs the bands of a spectral render, but the image is "
+            "in red, green and blue; remove it"
+        )
+    roles = [step.stage.role for step in chain.steps]
+    end = roles.index(StageRole.PATTERN) if StageRole.PATTERN in roles else len(roles)
+    sensor = (StageRole.EXPOSURE, StageRole.COLOURS_OF_LIGHT)
+    first, *others = chain.steps[:end]
+    observer = (ToXyz if truth == XYZ else ToSrgb)().resolve(first.context)
+    kept = [step for step in others if step.stage.role not in sensor]
+    return replace(chain, steps=(replace(first, method=observer), *kept))
 
 
 def noisy_mosaic(chain: Chain) -> Chain:

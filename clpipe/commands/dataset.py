@@ -21,7 +21,7 @@ from clpipe.chain.keys import CODE
 from clpipe.chain.options import OPTIONS
 from clpipe.chain.panorama import projection_of
 from clpipe.chain.registry import stage_in
-from clpipe.chain.rendition import CLEAN, TRUTHS
+from clpipe.chain.rendition import CLEAN, LIGHTS, TRUTHS
 from clpipe.chain.request import Request
 from clpipe.commands.chain_options import (
     SETTINGS,
@@ -164,7 +164,7 @@ class SourcePath(ExistingPath):
         text="Write the picture without noise (development), without noise and denoising (clean), "
         "the clean mosaic (mosaic), or its noise variance (variance).",
         default_text=CLEAN,
-        choices=TRUTHS,
+        choices=tuple(truth for truth in TRUTHS if truth not in LIGHTS),
     ),
     default=(CLEAN,),
 )

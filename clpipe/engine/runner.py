@@ -140,6 +140,7 @@ class Runner:
         On a CPU, launches run in bands unless ``bands`` is false.
         """
         bands &= self.bands
+        planar |= half and self.chain.bands > 0  # half bands have only one layout
         cpu = self.device.info.cpu if self.device and bands else None
         chain, results = self.chain, (self.keep, self.encode, self.final)
         key = *results, half, fold, planar, cpu, frame, undone(chain, frame)
@@ -160,10 +161,7 @@ class Runner:
     def plan_for(self, image: Array, frame: FrameKind = FrameKind.SINGLE) -> Plan:
         """Return the plan for an image."""
         size = image.shape[1::-1]
-        half = image.dtype == np.float16
-        # Half bands are read in planes.
-        planar = is_planar(image) or (half and self.chain.bands > 0)
-        options = half, min(self.chain.size(*size)) > 1, planar
+        options = image.dtype == np.float16, min(self.chain.size(*size)) > 1, is_planar(image)
         plan = self.plan(*options, frame=frame)
         return self.plan(*options, bands=False, frame=frame) if plan.is_tiny(*size) else plan
 

@@ -8,7 +8,7 @@ from clpipe.base.errors import ImageError
 from clpipe.images.clip_frames import clip_of, clip_size
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
 from clpipe.images.colour_names import space_of
-from clpipe.images.layers import is_spectral, picture_channels
+from clpipe.images.layers import find_picture, is_spectral, picture_channels
 from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
 from clpipe.images.raw import RAW_SUFFIXES, raw_size
@@ -89,6 +89,17 @@ def claim_of(path: Path, mosaic: bool = False, layer: str | None = None) -> Memo
             return _claim(file.spec(), file.format_name() == "openexr", mosaic, layer)
     except ImageError:
         return None
+
+
+def bands_in(path: Path, layer: str | None) -> tuple[float, ...]:
+    """Return the wavelengths of the bands that are read of a file, nm; () if there are none."""
+    try:
+        if clip_of(path) or path.suffix.lower() != ".exr" or not path.exists():
+            return ()
+        with open_image(path) as file:
+            return find_picture(path, file, False, layer).wavelengths
+    except (ImageError, OSError):
+        return ()  # reading the image says why
 
 
 def _claim(spec: Any, is_exr: bool, mosaic: bool, layer: str | None) -> MemoryClaim:

@@ -15,8 +15,10 @@ from clpipe.base.about import __version__
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import Stored, write_atomic
 from clpipe.base.types import Array, Doubles, Floats
+from clpipe.camera.colorimetry import adaptation
 from clpipe.camera.noise import NoiseModel
-from clpipe.camera.profile import SRGB_TO_XYZ
+from clpipe.camera.profile import SRGB_TO_XYZ, Camera
+from clpipe.camera.spectra import observer, sight_of
 from clpipe.images import tiff
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.tags import Tags, exif
@@ -26,7 +28,7 @@ from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.transfer import srgb_curve
 
 PREVIEW_SIDE = 512  # px, at most
-D65 = 21  # EXIF's LightSource number of this illuminant
+STANDARD_LIGHT_A, D65 = 17, 21  # EXIF's LightSource numbers of these illuminants
 NO_BLACK_RENDER = 1  # DefaultBlackRender: the converter subtracts nothing near black
 CURVE_POINTS = 33
 D50_XYZ = np.array([0.9642, 1.0, 0.8251])  # CIE XYZ of the white D50, Y = 1; sources differ by 1e-4
@@ -48,6 +50,8 @@ class Negative:
         noise: the noise model; None if it is unknown.
         tone: the tone curve for this raw, applied to linear sRGB, (height, width, 3), in units of
             the white level.
+        camera: the camera whose sensitivities give the colours for two lights; None writes
+            ``xyz_to_camera`` alone.
     """
 
     step: str | None
@@ -57,6 +61,7 @@ class Negative:
     xyz_to_camera: Doubles
     noise: NoiseModel | None
     tone: Callable[[Floats], Floats]
+    camera: Camera | None = None
 
 
 # The numbers of channels in a DNG (CFAPattern).
@@ -139,6 +144,29 @@ def xyz_to_camera(colours: Doubles, array: FilterArray) -> Doubles:
     return np.asarray(matrix / (matrix @ D50_XYZ).max())
 
 
+def two_light_fields(camera: Camera) -> tiff.Directory:
+    """Return ColorMatrix and ForwardMatrix for the lights A and D65, from a camera's sensitivities.
+
+    ColorMatrix converts CIE XYZ in the light to the raw's channels, and ForwardMatrix converts
+    channels after white balance to CIE XYZ under D50.
+    """
+    fields: tiff.Directory = {}
+    for number, (name, exif_number) in enumerate((("A", STANDARD_LIGHT_A), ("D65", D65))):
+        sight, d65 = sight_of(camera, name), SRGB_TO_XYZ.sum(1)
+        to_xyz = SRGB_TO_XYZ @ sight.to_srgb
+        red, blue = sight.gains
+        in_light = adaptation(d65, sight.light @ observer()) @ to_xyz @ np.diag([red, 1, blue])
+        color = np.linalg.inv(in_light)
+        color /= (color @ D50_XYZ).max()
+        forward = adaptation(d65, D50_XYZ) @ to_xyz
+        fields |= {
+            50721 + number: tiff.signed_rational(*color.ravel().round(7)),  # ColorMatrix
+            50778 + number: tiff.short(exif_number),  # CalibrationIlluminant
+            50964 + number: tiff.signed_rational(*forward.ravel().round(7)),  # ForwardMatrix
+        }
+    return fields
+
+
 def preview(dn: Array, negative: Negative) -> Array:
     """Return a small sRGB picture of a mosaic, (height, width, 3) uint8, at most 512 px per side.
 
@@ -206,6 +234,7 @@ def main_directory(
             50721: tiff.signed_rational(*negative.xyz_to_camera.ravel().round(7)),  # ColorMatrix1
             50728: tiff.rational(*neutral),  # AsShotNeutral
             50778: tiff.short(D65),  # CalibrationIlluminant1
+            **(two_light_fields(negative.camera) if negative.camera else {}),
         }
     return {
         **tiff.image_fields(thumbnail, subfile_type=1, photometric=2),  # photometric 2 is RGB

@@ -24,7 +24,7 @@ from clpipe.chain.overscan import overscan_step_count
 from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.settings import Settings
-from clpipe.images.claims import MemoryClaim, claim_of, mosaic_claim
+from clpipe.images.claims import MemoryClaim, bands_in, claim_of, mosaic_claim
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.images.raw import RAW_SUFFIXES
 from clpipe.images.read import (
@@ -160,7 +160,9 @@ class ImageLoader:
         is_raw = self.raw.is_raw
         if all(is_raw(job.path) for job in jobs):
             return loader.raw.first_chain(path)
-        return loader.kept.first_chain(path) if loader.kept else loader.chain
+        if loader.kept:
+            return loader.kept.first_chain(path)
+        return with_bands(loader.chain, bands_in(path, self.request.layer))
 
     def exposures(self, jobs: Sequence[Job], in_sequences: bool = False) -> list[Job]:
         """Return the jobs, with the files of one exposure or panorama joined into one job.

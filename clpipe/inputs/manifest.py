@@ -18,7 +18,7 @@ from clpipe.chain.keys import TABLES, check_type
 from clpipe.chain.methods import TABLE_MODELS, base_name
 from clpipe.chain.options import OPTIONS
 from clpipe.chain.paths import resolve_paths
-from clpipe.chain.registry import all_stages
+from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.settings import Settings, overlay
 from clpipe.chain.toml import toml_value, value_text
 from clpipe.inputs.jobs import Job
@@ -31,6 +31,7 @@ from clpipe.inputs.tables import (
     list_records,
 )
 from clpipe.inputs.times import decimal_text, time_of
+from clpipe.stage import StageRole
 
 MANIFEST_SUFFIXES = (".csv", ".jsonl", ".txt")
 # No other setting depends on these keys, and their values often differ by row.
@@ -147,7 +148,7 @@ def check_rows(
         RequestError: a value is not allowed, a camera or ISO does not exist, or a stage is not in
             the chain. The message is as for :func:`read_manifest`.
     """
-    steps = settings.step_names
+    steps = (*settings.step_names, stage_in(StageRole.SPECTRUM).name)
     errors: list[str] = []
     checked: list[Settings] = []
     checked_settings: dict[tuple[str, bool], Settings] = {}  # for rows with equal values

@@ -69,7 +69,14 @@ def negative_of(chain: Chain) -> Negative:
         xyz_to_camera=_xyz_to_camera(context.colours, later_matrix, array),
         noise=_noise_in_white_levels(context),
         tone=partial(run_reference, Neutral()),
+        camera=context.camera if _is_seen(context, array) else None,
     )
+
+
+def _is_seen(context: Context, array: FilterArray) -> bool:
+    """Return whether the colours of a raw follow from the sensitivities of red, green and blue."""
+    sight = context.sight
+    return sight is not None and sight.has_colours and set(array.channels) == set("RGB")
 
 
 def dng_of(chain: Chain) -> Negative:

@@ -13,7 +13,7 @@ from clpipe.chain.formats import DNG, FORMATS, NPY, extension_of
 from clpipe.chain.rendition import (
     BASELINES,
     DEFAULT_RENDITION,
-    FLOAT_MOSAICS,
+    FLOATS,
     PICTURES,
     VARIANCE,
     Rendition,
@@ -100,7 +100,7 @@ class OutputPlan:
         """Return the formats of a rendition."""
         if rendition.role in BASELINES:  # baselines have no raw
             return tuple(format_ for format_ in self.formats if format_ != DNG)
-        return (self.kept_format,) if rendition.role in FLOAT_MOSAICS else self.formats
+        return (self.kept_format,) if rendition.role in FLOATS else self.formats
 
     @property
     def kept_format(self) -> str:
@@ -117,7 +117,7 @@ class OutputPlan:
 
     def kept_steps(self, rendition: Rendition) -> tuple[str, ...]:
         """Return the steps whose images are written with a rendition."""
-        if rendition.role in (*FLOAT_MOSAICS, *BASELINES):
+        if rendition.role in (*FLOATS, *BASELINES):
             return ()
         if rendition.role in PICTURES:
             return self.request.truth_keep

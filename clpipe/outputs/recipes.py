@@ -14,6 +14,7 @@ from clpipe.chain.rendition import (
     BASELINES,
     CLEAN,
     DEVELOPMENT,
+    LIGHTS,
     MOSAIC,
     NOISY,
     PICTURES,
@@ -23,7 +24,7 @@ from clpipe.chain.rendition import (
     Role,
 )
 from clpipe.chain.settings import overlay
-from clpipe.chain.truth import noisy_mosaic, picture_without_noise, signal_and_noise
+from clpipe.chain.truth import light_of, noisy_mosaic, picture_without_noise, signal_and_noise
 from clpipe.outputs.baseline_noise import NoiseMatcher
 from clpipe.outputs.negative import dng_of
 from clpipe.stage import StageRole
@@ -201,6 +202,8 @@ def chain_and_noise(role: Role, chain: Chain) -> tuple[Chain, tuple[Step, ...]]:
         return signal_and_noise(chain)
     if role == MOSAIC:
         return noisy_mosaic(chain).without_noise(), ()
+    if role in LIGHTS:
+        return light_of(role, chain), ()
     if role in BASELINES:
         return baseline_of(chain), ()
     return chain if role == NOISY else picture_without_noise(role, chain), ()

@@ -12,6 +12,7 @@ from clpipe.base.files import Stored, sync_folder
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS, NPY, Format, extension_of
+from clpipe.chain.rendition import XYZ
 from clpipe.engine.runner import Result
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
@@ -150,7 +151,10 @@ class OutputWriter(OutputPlan):
             attributes = attributes_of(step, chain, recipe.key, rendition.frame)
             attributes |= kept_tags(chain, step, source, tags)
             attributes |= {"orientation": "1"} if turn != 1 else {}
-            return write_exr(path, image, kind.channels, attributes, half, margins)
+            channels = kind.channels
+            if rendition.role == XYZ:
+                channels, attributes["kind"] = ("X", "Y", "Z"), "xyz"
+            return write_exr(path, image, channels, attributes, half, margins)
 
         outputs: dict[Path, Stored] = {}
         keep = self.kept_steps(rendition)

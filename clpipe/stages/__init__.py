@@ -13,7 +13,6 @@ from pkgutil import iter_modules
 from clpipe.stage import Stage
 
 DEFAULT_CHAIN = (
-    "spectral_response",
     "projection",
     "shutter",
     "defocus",
