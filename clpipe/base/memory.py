@@ -2,14 +2,33 @@
 
 import re
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from clpipe.base.control_groups import group_folders
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.system import max_address_space
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+MADV_DONTNEED = 4  # Linux; mmap has the constant only there
 NO_LIMIT = 2**60  # bytes; without a limit, groups of version 1 report the largest page count
+
+
+def release_pages(array: Any) -> None:
+    """Release the memory of an array that is mapped from a file; its values stay in the file.
+
+    The system reads them again when they are used. Without this, memory would hold all of a file
+    that is larger than the memory. Other arrays do not change.
+    """
+    while isinstance(array, np.ndarray):
+        if isinstance(array, np.memmap) and array.mode == "c":
+            return  # its changes are only in memory
+        array = array.base
+    if isinstance(array, mmap) and hasattr(array, "madvise"):
+        array.madvise(MADV_DONTNEED)
 
 
 def parse_size(text: str) -> int:

@@ -150,13 +150,13 @@ def run(
             is depth in metres or object numbers. It also writes a PNG with 16 bits,
             OUT/NAME.LAYER.png, with depth in millimetres. FILE is the path from the image's
             directory, as in 'Depth=../depth/{name}.exr'. None is {name}_LAYER.exr or similar.
-        truth: write the picture without noise (development), without noise and denoising (clean),
-            the clean mosaic (mosaic), its noise variance (variance), or the clean picture with
-            uniform (iid) or intensity-dependent (intensity) noise. The noise of iid and intensity
-            is independent and as strong as the picture's. These two also write the ground truth
-            from which they are made. For a spectral render, also the light that reaches the sensor,
-            in CIE XYZ (xyz) or linear sRGB (linear_srgb). The choices are "development", "clean",
-            "mosaic", "variance", "xyz", "linear_srgb", "iid", "intensity".
+        truth: write the picture without noise (development) and denoising (clean), the clean
+            mosaic (mosaic), its noise variance (variance), spectral light (xyz) or (srgb), or
+            uniform (iid) or intensity-dependent (intensity) noise. The light is that of a spectral
+            render before the sensor, in CIE XYZ or linear sRGB. The noise of iid and intensity is
+            added to the clean picture. It is independent and as strong as the picture's. These two
+            also write the ground truth from which they are made. The choices are "development",
+            "clean", "mosaic", "variance", "xyz", "srgb", "iid", "intensity".
         truth_at: the moment of an exposure of several files whose pose and layers are written with
             the picture. Use all to write also the layers of its start and end. Use rows to take
             each row of the layers from the file in the middle of the row's exposure. The choices

@@ -15,11 +15,11 @@ from pydantic import FiniteFloat, TypeAdapter, ValidationError
 from clpipe.base.errors import RequestError
 from clpipe.chain.identity import MAX_FRAMES
 
-Truth = Literal["development", "clean", "mosaic", "variance", "xyz", "linear_srgb"]
+Truth = Literal["development", "clean", "mosaic", "variance", "xyz", "srgb"]
 Role = Literal["noisy", Truth, "iid", "intensity"]
 
 NOISY, *_ = ROLES = get_args(Role)
-DEVELOPMENT, CLEAN, MOSAIC, VARIANCE, XYZ, LINEAR_SRGB = TRUTHS = get_args(Truth)
+DEVELOPMENT, CLEAN, MOSAIC, VARIANCE, XYZ, SRGB = TRUTHS = get_args(Truth)
 IID, INTENSITY = BASELINES = ROLES[-2:]
 
 # Truths that look like the noisy picture, the light before the sensor, truths that are always

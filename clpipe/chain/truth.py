@@ -33,7 +33,7 @@ def picture_without_noise(truth: str, chain: Chain) -> Chain:
 def light_of(truth: str, chain: Chain) -> Chain:
     """Return the chain of the light that reaches the sensor, through the lens.
 
-    "xyz" is in CIE XYZ, and "linear_srgb" in linear sRGB. Both are in units of the render.
+    "xyz" is in CIE XYZ, and "srgb" in linear sRGB. Both are in units of the render.
 
     Raises:
         RequestError: the image has no spectral bands, or the chain does not read them.

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.memory import release_pages
 from clpipe.base.types import Array
 from clpipe.engine.buffers import Pool, aligned_empty
 
@@ -44,6 +45,7 @@ def fill(data: Array, parts: Sequence[Array], dtype: Any, stride: int) -> None:
         start, count = number * stride, part.size * np.dtype(dtype).itemsize
         target = data[start : start + count].view(dtype).reshape(part.shape)
         np.copyto(target, part, casting="unsafe")
+        release_pages(part)
 
 
 def _unmap(array: Array, queue: Any) -> None:

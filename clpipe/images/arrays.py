@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from clpipe.base.errors import ImageError
+from clpipe.base.memory import release_pages
 from clpipe.base.types import Array
 from clpipe.stage import Kind
 
@@ -71,7 +72,13 @@ def as_image(value: Any, kind: Kind, bands: int = 0) -> Array:
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
     step = max(1, BLOCK // max(image[0].size, 1))  # a cube may be larger than half of the memory
-    if not all(np.isfinite(image[i : i + step]).all() for i in range(0, len(image), step)):
+
+    def is_finite(rows: Array) -> bool:
+        found = bool(np.isfinite(rows).all())
+        release_pages(rows)
+        return found
+
+    if not all(is_finite(image[i : i + step]) for i in range(0, len(image), step)):
         wrong = np.argwhere(~np.isfinite(image))
         names = ("row", "column", "channel")[: image.ndim]
         place = ", ".join(f"{name} {i}" for name, i in zip(names, wrong[0], strict=True))

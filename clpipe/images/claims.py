@@ -12,6 +12,7 @@ from clpipe.images.layers import find_picture, is_spectral, picture_channels
 from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
 from clpipe.images.raw import RAW_SUFFIXES, raw_size
+from clpipe.images.samples import LARGE_CUBE, STRIP
 from clpipe.images.spectral import spectra_in
 
 FLOAT = 4  # bytes per float
@@ -109,6 +110,8 @@ def _claim(spec: Any, is_exr: bool, mosaic: bool, layer: str | None) -> MemoryCl
     spectra = [] if mosaic else spectra_in(spec.channelnames)
     if spectra and is_spectral(layer, {0: spectra}, picture is not None):
         picture = spectra[0].layer, spectra[0].channels
+        if len(picture[1]) * spec.width * spec.height > LARGE_CUBE:
+            return MemoryClaim(width, height, STRIP * FLOAT, 2 * STRIP * FLOAT)
     picture_formats = [formats[i] for i in picture[1]] if picture else formats
     sample = 2 if is_exr and all(each.size() == 2 for each in picture_formats) else FLOAT
     image = sample * (1 if mosaic else len(picture[1]) if picture else 3)

@@ -8,6 +8,7 @@ import numpy as np
 
 from clpipe.base.cpu_time import CpuTimer
 from clpipe.base.errors import ImageError
+from clpipe.base.memory import release_pages
 from clpipe.base.types import Array, Floats
 from clpipe.reference.geometry import NO_MARGINS, Margins
 
@@ -140,3 +141,4 @@ def _blocks_outside(pixels: Array, limit: Any) -> Iterator[Array]:
         bits = block.view(whole)
         if bits.max() > largest and (bits & without_sign).max() > largest:
             yield block
+        release_pages(pixels)

@@ -1,8 +1,11 @@
 """Reads samples and single values from image files, and computes digests of the files."""
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from math import prod
 from pathlib import Path
+from tempfile import TemporaryFile, gettempdir
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,7 @@ import OpenImageIO as oiio
 from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
+from clpipe.base.memory import release_pages
 from clpipe.base.types import Array
 from clpipe.images.layers import PictureLocation, mosaic_channel, picture_channels
 from clpipe.images.openexr import read_channels
@@ -20,6 +24,8 @@ from clpipe.reference.geometry import Margins
 
 LARGE_FILE = 4 << 20  # bytes; for smaller files, starting a thread takes longer than the SHA-256
 WAYS = "For a render, add --transfer srgb or --transfer linear. For a photograph, use -c unprocess"
+LARGE_CUBE = 1 << 28  # samples; larger spectral cubes are read to disk
+STRIP = 1 << 23  # samples that are read at a time
 MAX_CHANNEL_SPAN = 8  # channels; the channels of a picture may be hundreds apart
 
 
@@ -49,6 +55,47 @@ def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type
     pixels = np.asarray(data).reshape(spec.height, spec.width, last - first)
     order = [i - first for i in channels]
     return pixels if order == list(range(last - first)) else pixels[..., order]
+
+
+def read_to_disk(path: Path, file: Any, location: PictureLocation, type_: Any) -> Array:
+    """Return the bands of a part's data window like :func:`read_samples`, as a view of planes.
+
+    The planes are in a file that has no name any more, so they may be larger than the memory.
+
+    Raises:
+        ImageError: the part is damaged, or the disk is full.
+    """
+    spec, channels = file.spec(), location.channels
+    first, last = min(channels), max(channels) + 1
+    order = [i - first for i in channels]
+    step = spec.tile_height or max(1, STRIP // (spec.width * (last - first)))
+    dtype = np.float16 if type_ == oiio.HALF else np.float32
+    shape = len(channels), spec.height, spec.width
+    with TemporaryFile() as scratch:
+        try:
+            os.posix_fallocate(scratch.fileno(), 0, prod(shape) * np.dtype(dtype).itemsize)
+        except OSError as error:
+            raise ImageError(
+                f"{path}: its bands do not fit into {gettempdir()}: {error.strerror}; set TMPDIR "
+                "to a folder with more space"
+            ) from None
+        planes = np.memmap(scratch, dtype, "r+", shape=shape)
+    for y in range(0, spec.height, step):
+        rows = min(step, spec.height - y)
+        top, bottom = spec.y + y, spec.y + y + rows
+        if spec.tile_width:
+            columns = spec.x, spec.x + spec.width
+            samples = file.read_tiles(
+                *(location.part, 0, *columns, top, bottom, spec.z, spec.z + 1, first, last, type_)
+            )
+        else:
+            samples = file.read_scanlines(location.part, 0, top, bottom, spec.z, first, last, type_)
+        if samples is None:
+            raise ImageError(f"{path}: {damage_text(file.geterror())}")
+        samples = samples.reshape(rows, spec.width, last - first)
+        planes[:, y : y + rows] = samples.transpose(2, 0, 1)[order]
+        release_pages(planes)
+    return planes.transpose(1, 2, 0)
 
 
 def read_part(
@@ -84,7 +131,9 @@ def read_part(
     # Whole numbers keep their type, because OpenImageIO would scale them to 0..1 as floats.
     type_ = types.pop() if is_integer else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
     pixels = None
-    if file.format_name() == "openexr" and not is_integer:
+    if location.wavelengths and spec.width * spec.height * len(channels) > LARGE_CUBE:
+        pixels = read_to_disk(path, file, location, type_)
+    elif file.format_name() == "openexr" and not is_integer:
         pixels = read_channels(path, file, channels)
     if pixels is None:
         pixels = read_samples(path, file, location.part, channels, type_)
