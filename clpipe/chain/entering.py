@@ -140,8 +140,8 @@ def bands_warning(chain: Chain) -> str:
     if missed[worst] < MISSED:
         return ""
     return (
-        f"its bands from {nm[0]:g} to {nm[-1]:g} nm miss {missed[worst]:.1%} of what {worst} sees "
-        "of white; render more bands"
+        f"its bands from {nm[0]:g} to {nm[-1]:g} nm miss {100 * missed[worst]:.1f} % of what "
+        f"{worst} sees of white; render more bands"
     )
 
 

@@ -38,9 +38,7 @@ class RenderCamera(BaseModel):
     # The horizontal field of view in radians, as in transforms.json.
     camera_angle_x: Annotated[float, Field(gt=0, lt=math.pi)] | None = None
     # The centres of the bands of a spectral render, nm. A file states its own.
-    wavelengths: Annotated[
-        tuple[Wavelength, ...], Field(strict=False, min_length=2, max_length=2000)
-    ] = ()
+    wavelengths: Annotated[tuple[Wavelength, ...], Field(strict=False, max_length=2000)] = ()
     # The light of the scene, to which the camera is balanced. An RGB render is lit by it.
     illuminant: Annotated[str, Field(max_length=4096)] = ""
     # From world to camera, in OpenCV's axes: x_cam = rotation x + translation.
@@ -55,8 +53,8 @@ class RenderCamera(BaseModel):
     def _check_pose(self) -> Self:
         if (self.rotation is None) != (self.translation is None):
             raise ValueError("only one of rotation and translation is set; set both or neither")
-        if any(a >= b for a, b in pairwise(self.wavelengths)):
-            raise ValueError("wavelengths must ascend")
+        if len(self.wavelengths) == 1 or any(a >= b for a, b in pairwise(self.wavelengths)):
+            raise ValueError("wavelengths must be two or more, and ascend")
         return self
 
     @property

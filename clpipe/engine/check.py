@@ -10,6 +10,7 @@ from clpipe.base.types import Array
 from clpipe.chain.chain import Chain
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages, stage_in
+from clpipe.chain.render_camera import RenderCamera
 from clpipe.chain.settings import Settings
 from clpipe.engine.device import Device
 from clpipe.engine.options import RunOptions
@@ -21,6 +22,7 @@ from clpipe.stage import PERIOD, Kind, Method, Stage, StageRole, variant_label, 
 
 # Odd sizes, one pixel wide and high, smaller than the widest border, more than one work-group.
 SIZES = ((1, 1), (1, 9), (11, 1), (2, 3), (6, 5), (37, 53), (9, 530))
+BANDS = (420.0, 470.0, 500.0, 560.0, 610.0, 680.0, 700.0)  # nm; of a spectral render
 ISO = 3200  # an ISO at which every stage has an effect
 
 
@@ -61,15 +63,17 @@ class Check:
         return {**values.pop("difference"), **values, "passed": self.passed}
 
 
-def example(kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0) -> Array:
-    """Return a random image of a kind, (height, width[, channel]).
+def example(
+    kind: Kind, size: tuple[int, int], half: bool = False, seed: int = 0, bands: int = 0
+) -> Array:
+    """Return a random image of a kind, (height, width[, channel]), or one with spectral bands.
 
     Its signals range from -0.05, which a 14-bit ADC clips at 0 DN, to 1.35.
     """
     random = np.random.default_rng(seed)
     if kind is Kind.RAW:
         return random.integers(0, 16384, size).astype(np.float32)
-    shape = size if len(kind.channels) == 1 else (*size, len(kind.channels))
+    shape = size if len(kind.channels) == 1 else (*size, bands or len(kind.channels))
     values = random.random(shape) ** 2 * 1.4 - 0.05
     return values.astype(np.float16 if half else np.float32)
 
@@ -105,7 +109,7 @@ def compare(
     on_device, in_numpy = (Runner(chain, d, encode=False, final=True) for d in (device, None))
     total = Difference()
     for seed, size in enumerate(sizes):
-        image = example(chain.source, size, half, seed)
+        image = example(chain.source, size, half, seed, chain.bands)
         result, expected = (last_frame(runner, image) for runner in (on_device, in_numpy))
         total += difference(result, expected)
     return total
@@ -143,7 +147,9 @@ def chain_for(stage: Stage, method: type[Method], values: Mapping[str, Any], pat
     parameters[stage.name] = {
         k: v for k, v in stage_parameters.items() if k in method.model_fields
     } | method_parameters
-    settings = Settings(iso=ISO, stages=(*earlier_stages, stage.name), parameters=parameters)
+    render = RenderCamera(wavelengths=BANDS if stage.role is StageRole.SPECTRUM else ())
+    stages = (*earlier_stages, stage.name)
+    settings = Settings(iso=ISO, stages=stages, parameters=parameters, render=render)
     return make_chain(settings, start_at=stage.name)
 
 
