@@ -14,6 +14,7 @@ from clpipe.camera.sensitivities import Sensitivities
 from clpipe.camera.spectra import (
     GRID,
     ILLUMINANTS,
+    STEP,
     Sight,
     band_weights,
     light,
@@ -25,7 +26,7 @@ from clpipe.camera.spectra import (
 CAMERAS = ("sony-a7r2", "canon-5d3", "nikon-d850", "nikon-d7000", "fujifilm-x-t3")
 SHAPE = colour.SpectralShape(380, 780, 5)
 NM = np.arange(380.0, 781, 5)
-AT = NM.astype(int) - int(GRID[0])  # places of these wavelengths on the grid
+AT = np.rint((NM - GRID[0]) / STEP).astype(int)  # places of these wavelengths on the grid
 CHECKER = np.stack(
     [each.copy().align(SHAPE).values for each in colour.SDS_COLOURCHECKERS["ISO 17321-1"].values()]
 )
@@ -40,7 +41,7 @@ def test_lights(name):
     expected = peer_light(name).values
     found = light(name)[AT]
     assert found / found.max() == pytest.approx(expected / expected.max(), abs=1e-4)
-    x, y, z = light(name) @ observer()
+    x, y, z = light(name) @ observer() * STEP
     assert y == pytest.approx(1)
     named = {"F11": "FL11"}.get(name, name)
     white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"][named]
@@ -77,7 +78,7 @@ def test_colours_of_a_checker(name, lamp):
     assert seen == pytest.approx(expected, rel=5e-3)
     # The matrix makes of them nearly the colours that the eye sees.
     xyz = (CHECKER * light(lamp)[AT]) @ band_weights(observer(), NM)
-    adapted = adaptation(light(lamp) @ observer(), SRGB_TO_XYZ.sum(1))
+    adapted = adaptation(sight.white_xyz, SRGB_TO_XYZ.sum(1))
     true = xyz @ (np.linalg.inv(SRGB_TO_XYZ) @ adapted).T
     errors = colour.delta_E(lab_of(seen @ sight.to_srgb.T), lab_of(true), method="CIE 2000")
     assert errors.mean() < 2.0
@@ -116,10 +117,11 @@ def test_the_matrix_is_that_of_the_academy(name):
 def test_the_fit_is_a_minimum():
     sight = sight_of(load_camera("sony-a7r2"), "F11")
     seen = reflectances() @ (
-        np.stack([sight.response(c) / sight.white(c) for c in "RGB"], -1) * sight.light[:, None]
+        np.stack([sight.response(c) / sight.white(c) for c in "RGB"], -1)
+        * (sight.light[:, None] * STEP)
     )
-    xyz = reflectances() @ (observer() * sight.light[:, None])
-    adapted = adaptation(sight.light @ observer(), SRGB_TO_XYZ.sum(1))
+    xyz = reflectances() @ (observer() * sight.light[:, None] * STEP)
+    adapted = adaptation(sight.white_xyz, SRGB_TO_XYZ.sum(1))
     true = lab_of(xyz @ (np.linalg.inv(SRGB_TO_XYZ) @ adapted).T)
 
     def cost(matrix):
@@ -155,7 +157,9 @@ def test_sums_that_are_not_red_green_and_blue():
         sight,
         sensitivities=Sensitivities(wavelengths=(400, 600), curves={**{"W": (9, 9)}}),
     )
-    assert own.white("W") == pytest.approx(9 * light("D65")[(GRID >= 400) & (GRID <= 600)].sum())
+    assert own.white("W") == pytest.approx(
+        9 * light("D65")[(GRID >= 400) & (GRID <= 600)].sum() * STEP
+    )
     assert own.gains == (1, 1) and not own.has_colours
     with pytest.raises(RequestError, match="curves for W, but not for R, which the filter array"):
         own.white("L")
@@ -175,7 +179,7 @@ def test_quantum_efficiencies_lens_and_infrared_cut():
     # Relative curves are for energy: their quantum efficiency is highest where curve / nm is.
     sight = Sight(relative, light("D65"))
     efficiency = relative.at(GRID)[:, 0] / GRID / (0.6 / 600) * 0.5
-    charge = (light("D65") * efficiency * GRID * 1e-9).sum() / (6.62607015e-34 * 299792458)
+    charge = (light("D65") * efficiency * GRID * 1e-9).sum() * STEP / (6.62607015e-34 * 299792458)
     assert sight.electrons("G", 0.5) == pytest.approx(charge, rel=1e-6)
     with pytest.raises(RequestError, match=r"set exposure\.quantum_efficiency"):
         sight.electrons("G", None)
@@ -193,7 +197,8 @@ def test_a_light_from_a_file(tmp_path):
     path.write_text("wavelength,power\n400,0\n500,2\n700,2\n")
     found = light(str(path))
     assert found[(GRID < 400) | (GRID > 700)].max() == 0
-    assert found[150] == pytest.approx(found[200] / 2) and found[200] == found[400]
+    at_450, at_500, at_700 = (found[GRID.searchsorted(nm - 0.05)] for nm in (450, 500, 700))
+    assert at_450 == pytest.approx(at_500 / 2) and at_500 == at_700
     for text in ("a,b\n", "400,1\n500\n", "500,1\n400,1\n", "400,-1\n500,1\n", "900,1\n950,1\n"):
         path.write_text(text)
         with pytest.raises(RequestError, match="not the spectrum of a light"):

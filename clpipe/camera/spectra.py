@@ -1,6 +1,6 @@
 """Spectra: lights, the eye, and what a sensor sees of them.
 
-All integrals are sums in steps of 1 nm over :data:`GRID`. Curves are linear between their points.
+All integrals are sums over :data:`GRID`. Curves are linear between their points.
 """
 
 import csv
@@ -20,7 +20,8 @@ from clpipe.camera.colorimetry import adaptation, lab_of
 from clpipe.camera.profile import SRGB_TO_XYZ, Camera
 from clpipe.camera.sensitivities import Sensitivities
 
-GRID = np.arange(300.0, 1101.0)  # nm
+STEP = 0.1  # nm
+GRID = np.linspace(300.0, 1100.0, 8001)  # nm
 ILLUMINANTS = ("A", "D65", "F11", "LED-B3")
 DEFAULT_ILLUMINANT = "D65"  # the white of a render in sRGB
 PLANCK_TIMES_LIGHT_SPEED = 1.98644586e-25  # J m (CODATA 2018)
@@ -45,12 +46,11 @@ def _on_grid(name: str, outside: float | None = 0.0) -> Doubles:
 
 @cache
 def observer() -> Doubles:
-    """The CIE 1931 colour-matching functions, (wavelength, 3), scaled so that the sum of y is 1."""
+    """The CIE 1931 colour-matching functions, (wavelength, 3), with an integral of y of 1."""
     curves = np.stack([_on_grid(name) for name in "xyz"], axis=-1)
-    return np.asarray(curves / curves[:, 1].sum())
+    return np.asarray(curves / (curves[:, 1].sum() * STEP))
 
 
-@cache
 def reflectances() -> Doubles:
     """190 reflectances to which colour matrices are fitted, (sample, wavelength)."""
     file = resources.files("clpipe.camera") / "data" / "reflectances.csv"
@@ -63,7 +63,7 @@ def light(name: str) -> Doubles:
 
     A is the formula of CIE 15:2018, D65, F11 and LED-B3 are its tables.
 
-    >>> round(float(light("A")[260] / light("A")[150]), 3)  # 560 nm over 450 nm
+    >>> round(float(light("A")[2600] / light("A")[1500]), 3)  # 560 nm over 450 nm
     3.022
 
     Args:
@@ -111,7 +111,7 @@ def _light_of(text: str, name: str) -> Doubles:
 
 
 def _scaled(spectrum: Doubles) -> Doubles:
-    return np.asarray(spectrum / (spectrum @ observer()[:, 1]))
+    return np.asarray(spectrum / (spectrum @ observer()[:, 1] * STEP))
 
 
 def band_edges(wavelengths: Sequence[float]) -> Doubles:
@@ -141,11 +141,12 @@ def band_weights(curves: Doubles, wavelengths: Sequence[float]) -> Doubles:
     """
     steps = (curves[1:] + curves[:-1]) / 2
     below = np.concatenate([np.zeros_like(curves[:1]), np.cumsum(steps, axis=0)])
-    at = np.clip(band_edges(wavelengths), GRID[0], GRID[-1]) - GRID[0]
+    at = (np.clip(band_edges(wavelengths), GRID[0], GRID[-1]) - GRID[0]) / STEP
     cell = np.minimum(at.astype(int), GRID.size - 2)
     part = (at - cell)[:, None]
     slope = curves[cell + 1] - curves[cell]
-    return np.diff(below[cell] + part * curves[cell] + part**2 / 2 * slope, axis=0)
+    inside = part * curves[cell] + part**2 / 2 * slope
+    return np.diff(below[cell] + inside, axis=0) * STEP
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +187,7 @@ class Sight:
 
     def white(self, channel: str) -> float:
         """Return a channel's response to white."""
-        return float(self.response(channel) @ self.light)
+        return float(self.response(channel) @ self.light) * STEP
 
     @cached_property
     def has_colours(self) -> bool:
@@ -202,9 +203,15 @@ class Sight:
         return green / red, green / blue
 
     @cached_property
+    def white_xyz(self) -> Doubles:
+        """CIE X, Y and Z of the light, Y = 1."""
+        return np.asarray(self.light @ observer() * STEP)
+
+    @cached_property
     def _white_balanced(self) -> Doubles:
-        """The light times the response of red, green and blue, over that of white."""
-        return np.stack([self.response(c) / self.white(c) for c in "RGB"], -1) * self.light[:, None]
+        """The light times the response of red, green and blue, with an integral of 1."""
+        seen = np.stack([self.response(c) / self.white(c) for c in "RGB"], axis=-1)
+        return seen * self.light[:, None] * STEP
 
     @cached_property
     def to_srgb(self) -> Doubles:
@@ -213,9 +220,10 @@ class Sight:
         It minimises the squared differences in CIELAB of :func:`reflectances` in this light, whose
         white the eye adapts to D65 (Bradford). This is the criterion of the Academy's P-2013-001.
         """
-        seen = reflectances() @ self._white_balanced
-        xyz = reflectances() @ (observer() * self.light[:, None])
-        adapted = adaptation(self.light @ observer(), SRGB_TO_XYZ.sum(1))
+        samples = reflectances()
+        seen = samples @ self._white_balanced
+        xyz = samples @ (observer() * self.light[:, None]) * STEP
+        adapted = adaptation(self.white_xyz, SRGB_TO_XYZ.sum(1))
         true = xyz @ (np.linalg.inv(SRGB_TO_XYZ) @ adapted).T
         # White stays white if each row adds up to 1, so two numbers of each are free.
         free, green = seen[:, [0, 2]] - seen[:, [1]], seen[:, [1]]
@@ -271,7 +279,7 @@ class Sight:
             RequestError: it is needed, but not known.
         """
         scale = self.sensitivities.electrons_per_energy(efficiency)
-        return float(self.response(channel) @ self.light) * scale / PLANCK_TIMES_LIGHT_SPEED
+        return self.white(channel) * scale / PLANCK_TIMES_LIGHT_SPEED
 
 
 @lru_cache(maxsize=64)

@@ -18,7 +18,7 @@ from clpipe.base.types import Array, Doubles, Floats
 from clpipe.camera.colorimetry import adaptation
 from clpipe.camera.noise import NoiseModel
 from clpipe.camera.profile import SRGB_TO_XYZ, Camera
-from clpipe.camera.spectra import observer, sight_of
+from clpipe.camera.spectra import sight_of
 from clpipe.images import tiff
 from clpipe.images.encoding import SIMULATED
 from clpipe.images.tags import Tags, exif
@@ -155,7 +155,7 @@ def two_light_fields(camera: Camera) -> tiff.Directory:
         sight, d65 = sight_of(camera, name), SRGB_TO_XYZ.sum(1)
         to_xyz = SRGB_TO_XYZ @ sight.to_srgb
         red, blue = sight.gains
-        in_light = adaptation(d65, sight.light @ observer()) @ to_xyz @ np.diag([red, 1, blue])
+        in_light = adaptation(d65, sight.white_xyz) @ to_xyz @ np.diag([red, 1, blue])
         color = np.linalg.inv(in_light)
         color /= (color @ D50_XYZ).max()
         forward = adaptation(d65, D50_XYZ) @ to_xyz
