@@ -377,7 +377,7 @@ def test_an_image_has_the_same_bits_however_it_is_cut(device, request, name, way
 def lane_of(stage, method):
     """Return a chain of one method, and an image of which red and blue differ."""
     chain = chain_for(stage, method, {}, "GRBG")
-    image = example(chain.source, (150, 203))
+    image = example(chain.source, (150, 203), bands=chain.bands)
     image[::2] *= 0.5
     return chain, image
 

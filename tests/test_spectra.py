@@ -3,7 +3,6 @@
 from dataclasses import replace
 from itertools import pairwise
 
-import colour
 import numpy as np
 import pytest
 
@@ -22,6 +21,9 @@ from clpipe.camera.spectra import (
     reflectances,
     sight_of,
 )
+
+with np.printoptions():  # colour-science changes how NumPy prints numbers
+    import colour
 
 CAMERAS = ("sony-a7r2", "canon-5d3", "nikon-d850", "nikon-d7000", "fujifilm-x-t3")
 SHAPE = colour.SpectralShape(380, 780, 5)

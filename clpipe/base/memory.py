@@ -6,8 +6,6 @@ from mmap import mmap
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from clpipe.base.control_groups import group_folders
 from clpipe.base.errors import DeviceError, RequestError
 from clpipe.base.system import max_address_space
@@ -23,11 +21,11 @@ def release_pages(array: Any) -> None:
     The system reads them again when they are used. Without this, memory would hold all of a file
     that is larger than the memory. Other arrays do not change.
     """
-    while isinstance(array, np.ndarray):
-        if isinstance(array, np.memmap) and array.mode == "c":
+    while array is not None and not isinstance(array, mmap):
+        if getattr(array, "mode", "") == "c":
             return  # its changes are only in memory
-        array = array.base
-    if isinstance(array, mmap) and hasattr(array, "madvise"):
+        array = getattr(array, "base", None)
+    if array is not None and hasattr(array, "madvise"):
         array.madvise(MADV_DONTNEED)
 
 

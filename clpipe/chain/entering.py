@@ -8,7 +8,7 @@ import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.chain.keys import RENDER
 from clpipe.chain.layers import layer_steps, layer_warnings, reads_layers, with_layers
 from clpipe.chain.making import make_chain
@@ -18,7 +18,7 @@ from clpipe.chain.settings import overlay
 from clpipe.chain.void import black_area_warning
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
-from clpipe.stage import ImageLayer, StageRole
+from clpipe.stage import ImageLayer
 from clpipe.stage.method import parameters_with
 from clpipe.stages.exposure.radiometric import Radiometric
 
@@ -61,9 +61,15 @@ def prepare_image(
 
     Raises:
         ImageError: ``layer`` raises it.
-        RequestError: the camera's values contradict each other, or a step cannot use its layer.
+        RequestError: the camera's values contradict each other, or a step cannot use its layer or
+            the image.
     """
-    check_radiance(chain)
+    if not chain.bands and needs_bands(chain):
+        raise RequestError(
+            "exposure.method=radiometric: this method needs spectral bands, but the image "
+            "is in red, green and blue. For a render in cd/m2, use photometric. To read a file's "
+            "bands, add --layer spectral"
+        )
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.frame_size(*pixels.shape[1::-1])
         optics = chain.optics
@@ -80,7 +86,8 @@ def prepare_image(
     elif margins:
         chain = with_overscan(chain, margins)
     height, width = pixels.shape[:2]
-    texts = black_area_warning(chain, width, height), bands_warning(chain)
+    texts = [black_area_warning(chain, width, height)]
+    texts += [bands_warning(chain)] if chain.bands else []
     warnings = tuple(filter(None, texts))
     if layer is None or pixels.ndim != 3 or not reads_layers(chain):
         return PreparedImage(chain, pixels, margins, warnings=warnings)
@@ -114,25 +121,16 @@ def with_bands(chain: Chain, wavelengths: tuple[float, ...]) -> Chain:
     return make_chain(settings, chain.source, until=chain.steps[-1].name)
 
 
-def check_radiance(chain: Chain) -> None:
-    """Check that an exposure in W/(m2 sr nm) has spectra.
-
-    Raises:
-        RequestError: the image is in red, green and blue.
-    """
-    step = chain.step_in(StageRole.EXPOSURE)
-    if step and isinstance(step.method, Radiometric) and not chain.bands:
-        raise RequestError(
-            f"{step.name}.method={step.method.method}: this method needs spectral bands, but the "
-            "image is in red, green and blue. For a render in cd/m2, use photometric. To read a "
-            "file's bands, add --layer spectral"
-        )
+@cached_by_structure
+def needs_bands(chain: Chain) -> bool:
+    """Return whether the exposure of a chain is computed from spectra."""
+    return any(isinstance(step.method, Radiometric) for step in chain.steps)
 
 
 def bands_warning(chain: Chain) -> str:
     """Return a warning if the bands of a render miss light that the sensor sees; "" if not."""
     context = chain.steps[0].context
-    if not chain.bands or context.sight is None:
+    if context.sight is None:
         return ""
     array, nm = context.array_ahead, context.wavelengths
     missed = {channel: context.sight.missed(nm, channel) for channel in array.channels}

@@ -183,10 +183,11 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
 
 def step_names_of(settings: Settings) -> tuple[str, ...]:
     """Return the names of the steps; a spectral render has the spectral response before them."""
-    spectral = stage_in(StageRole.SPECTRUM).name
-    if not settings.render.wavelengths or spectral in (*settings.stages, *settings.skip):
+    if not settings.render.wavelengths:
         return settings.step_names
-    return spectral, *settings.step_names
+    spectral = stage_in(StageRole.SPECTRUM).name
+    added = () if spectral in (*settings.stages, *settings.skip) else (spectral,)
+    return *added, *settings.step_names
 
 
 def sight_of_render(
@@ -197,10 +198,13 @@ def sight_of_render(
     Raises:
         RequestError: the camera has no sensitivities, or the light is unknown.
     """
-    sees = isinstance(methods.get(stage_in(StageRole.SPECTRUM).name), CameraResponse)
-    if not (settings.render.illuminant or (settings.render.wavelengths and sees)):
+    render = settings.render
+    if not render.illuminant and not render.wavelengths:
         return None
-    return sight_of(camera, settings.render.illuminant or DEFAULT_ILLUMINANT)
+    sees = isinstance(methods.get(stage_in(StageRole.SPECTRUM).name), CameraResponse)
+    if not render.illuminant and not sees:
+        return None
+    return sight_of(camera, render.illuminant or DEFAULT_ILLUMINANT)
 
 
 def _array_ahead(

@@ -13,12 +13,10 @@ def steps_to_mosaic(chain: Chain) -> tuple[Step, ...] | None:
 
     The chain begins with the spectral response of the camera.
     """
+    if not chain.bands or not isinstance(chain.steps[0].method, CameraResponse):
+        return None
     roles = [step.stage.role for step in chain.steps]
-    if not chain.bands or StageRole.PATTERN not in roles:
-        return None
-    if not isinstance(chain.steps[0].method, CameraResponse):
-        return None
-    return chain.steps[1 : roles.index(StageRole.PATTERN)]
+    return chain.steps[1 : roles.index(StageRole.PATTERN)] if StageRole.PATTERN in roles else None
 
 
 def _is_by_pixel(step: Step) -> bool:

@@ -45,7 +45,8 @@ def fill(data: Array, parts: Sequence[Array], dtype: Any, stride: int) -> None:
         start, count = number * stride, part.size * np.dtype(dtype).itemsize
         target = data[start : start + count].view(dtype).reshape(part.shape)
         np.copyto(target, part, casting="unsafe")
-        release_pages(part)
+        if type(part) is np.memmap:
+            release_pages(part)
 
 
 def _unmap(array: Array, queue: Any) -> None:

@@ -71,14 +71,7 @@ def as_image(value: Any, kind: Kind, bands: int = 0) -> Array:
         )
     if image.dtype not in (np.float16, np.float32):
         image = image.astype(np.float32)
-    step = max(1, BLOCK // max(image[0].size, 1))  # a cube may be larger than half of the memory
-
-    def is_finite(rows: Array) -> bool:
-        found = bool(np.isfinite(rows).all())
-        release_pages(rows)
-        return found
-
-    if not all(is_finite(image[i : i + step]) for i in range(0, len(image), step)):
+    if not is_finite(image):
         wrong = np.argwhere(~np.isfinite(image))
         names = ("row", "column", "channel")[: image.ndim]
         place = ", ".join(f"{name} {i}" for name, i in zip(names, wrong[0], strict=True))
@@ -89,6 +82,16 @@ def as_image(value: Any, kind: Kind, bands: int = 0) -> Array:
     return image
 
 
+def is_finite(image: Array) -> bool:
+    """Return whether all samples are finite. The image may be larger than half of the memory."""
+    if image.size <= BLOCK:
+        return bool(np.isfinite(image).all())
+    halves = np.array_split(image, 2, axis=int(np.argmax(image.shape[:2])))
+    found = all(map(is_finite, halves))
+    release_pages(image)
+    return found
+
+
 def check_shape(shape: tuple[int, ...], kind: Kind, bands: int = 0) -> None:
     """Check that an array has the shape of one image of a kind.
 
@@ -97,15 +100,8 @@ def check_shape(shape: tuple[int, ...], kind: Kind, bands: int = 0) -> None:
     """
     channels = bands or len(kind.channels)
     expected = f"(height, width, {channels})" if channels > 1 else "(height, width)"
-    if (
-        0 not in shape
-        and len(shape) == (3 if channels > 1 else 2)
-        and shape[2:]
-        in (
-            (),
-            (channels,),
-        )
-    ):
+    last = () if channels == 1 else (channels,)
+    if 0 not in shape and len(shape) == 2 + len(last) and shape[2:] == last:
         return
     advice = ""
     if bands:

@@ -141,4 +141,5 @@ def _blocks_outside(pixels: Array, limit: Any) -> Iterator[Array]:
         bits = block.view(whole)
         if bits.max() > largest and (bits & without_sign).max() > largest:
             yield block
-        release_pages(pixels)
+        if type(pixels) is np.memmap:
+            release_pages(pixels)

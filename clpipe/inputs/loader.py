@@ -313,10 +313,10 @@ class ImageLoader:
             )
 
         around = source.panorama
-        entry_ = prepare_image(
-            with_bands(loaded.chain, source.wavelengths),
-            *(source.pixels, source.margins, layer, source.shot, around),
-        )
+        chain = loaded.chain
+        if source.wavelengths != chain.settings.render.wavelengths:
+            chain = with_bands(chain, source.wavelengths)
+        entry_ = prepare_image(chain, source.pixels, source.margins, layer, source.shot, around)
         if entry_.pixels is source.pixels and not (
             entry_.margins or entry_.layers or entry_.warnings
         ):

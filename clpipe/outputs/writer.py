@@ -12,7 +12,7 @@ from clpipe.base.files import Stored, sync_folder
 from clpipe.base.types import Array, Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.formats import DNG, FORMATS, NPY, Format, extension_of
-from clpipe.chain.rendition import XYZ
+from clpipe.chain.rendition import LIGHTS, XYZ
 from clpipe.engine.runner import Result
 from clpipe.images.dng import write_dng
 from clpipe.images.read import SourceImage
@@ -148,13 +148,12 @@ class OutputWriter(OutputPlan):
             image, kind = upright(image, turn), step.stage.writes
             if path.suffix == f".{NPY}":
                 return write_npy(path, to_npy_type(image, kind, _white_level(step)))
+            if rendition.role in LIGHTS:  # a render like any other
+                return write_exr(path, image, "XYZ" if rendition.role == XYZ else "RGB", {})
             attributes = attributes_of(step, chain, recipe.key, rendition.frame)
             attributes |= kept_tags(chain, step, source, tags)
             attributes |= {"orientation": "1"} if turn != 1 else {}
-            channels = kind.channels
-            if rendition.role == XYZ:
-                channels, attributes["kind"] = ("X", "Y", "Z"), "xyz"
-            return write_exr(path, image, channels, attributes, half, margins)
+            return write_exr(path, image, kind.channels, attributes, half, margins)
 
         outputs: dict[Path, Stored] = {}
         keep = self.kept_steps(rendition)
