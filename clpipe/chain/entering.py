@@ -14,11 +14,12 @@ from clpipe.chain.layers import layer_steps, layer_warnings, reads_layers, with_
 from clpipe.chain.making import make_chain
 from clpipe.chain.overscan import overscan_step_count, with_overscan
 from clpipe.chain.panorama import with_panorama
+from clpipe.chain.registry import stage_in
 from clpipe.chain.settings import overlay
 from clpipe.chain.void import black_area_warning
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
-from clpipe.stage import ImageLayer
+from clpipe.stage import ImageLayer, StageRole
 from clpipe.stage.method import parameters_with
 from clpipe.stages.exposure.radiometric import Radiometric
 
@@ -66,9 +67,9 @@ def prepare_image(
     """
     if not chain.bands and needs_bands(chain):
         raise RequestError(
-            "exposure.method=radiometric: this method needs spectral bands, but the image "
-            "is in red, green and blue. For a render in cd/m2, use photometric. To read a file's "
-            "bands, add --layer spectral"
+            f"{stage_in(StageRole.EXPOSURE).name}.method={Radiometric.method}: this method needs "
+            "spectral bands, but the image is in red, green and blue. For a render in cd/m2, use "
+            "photometric. To read a file's bands, add --layer spectral"
         )
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.frame_size(*pixels.shape[1::-1])

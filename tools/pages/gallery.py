@@ -1,9 +1,10 @@
-"""Make the pictures of the documentation's first page: cameras and ISOs, and ground truth.
+"""Make pictures of the documentation: cameras and ISOs, ground truth, lamps.
 
     tools/run pages gallery
 
-It writes docs/gallery_cameras.webp and docs/gallery_truths.webp. Their cells are results of the
-commands above them in docs/index.md. The ground truth is of a view of the reconstruction.
+It writes docs/gallery_cameras.webp, docs/gallery_truths.webp and docs/gallery_lamps.webp. Their
+cells are results of the commands above them in docs/index.md and docs/spectral.md. The ground truth
+is of a view of the reconstruction.
 """
 
 from pathlib import Path
@@ -16,6 +17,7 @@ from PIL import Image
 
 import clpipe
 from clpipe.base.types import Array
+from clpipe.camera.spectra import ILLUMINANTS
 from tools import RENDER, ROOT
 from tools.shared.options import parser_of
 from tools.shared.pictures import enlarged, sheet
@@ -42,6 +44,23 @@ def cameras(folder: Path) -> Image.Image:
             row.append((camera if iso == ISOS[0] else "", enlarged(crop, SCALE)))
         rows.append(row)
     return sheet(rows, [f"ISO {iso}" for iso in ISOS])
+
+
+def lamps(folder: Path) -> Image.Image:
+    """Return a crop of a render under lamps, with gains for daylight and with their own."""
+    left, top, width, height = CROP
+    rows = []
+    for gains in ("gains", "as_shot"):
+        row = []
+        for lamp in ILLUMINANTS:
+            out = folder / gains / lamp
+            settings = {"render": {"illuminant": lamp}, "white_balance": {"method": gains}}
+            list(clpipe.run(RENDER, out, iso=1600, format="png", **settings))
+            picture = Image.open(out / f"{RENDER.stem}.png")
+            crop = np.asarray(picture.crop((left, top, left + width, top + height)))
+            row.append((lamp if gains == "gains" else "", enlarged(crop, SCALE)))
+        rows.append(row)
+    return sheet(rows, ["gains", "as_shot"])
 
 
 def truths(folder: Path) -> Image.Image:
@@ -82,7 +101,7 @@ def main() -> None:
     """Write the pictures."""
     parser_of(__doc__).parse_args()
     with TemporaryDirectory() as name:
-        for stem, make in (("cameras", cameras), ("truths", truths)):
+        for stem, make in (("cameras", cameras), ("truths", truths), ("lamps", lamps)):
             path = ROOT / "docs" / f"gallery_{stem}.webp"
             make(Path(name, stem)).save(path, quality=88, method=6)
             print(path.relative_to(ROOT))
