@@ -80,6 +80,9 @@ def test_other_colours_and_uneven_steps(imported):
     assert list(curves.curves) == ["C", "M", "Y", "W"]
     assert curves.at(np.array([401.75]))[0].tolist() == [1, 1.5, 1.5, 2.5]
     assert curves.at(np.array([399.0, 701.0])).tolist() == [[0] * 4] * 2
+    text = "wavelength,infrared_cut,G\n400,1,0.5\n700,0.5,1\n"
+    curves = imported("curves.csv", text).sensitivities
+    assert curves.infrared_cut == (1, 0.5) and curves.at(np.array([700.0])).tolist() == [[0.5]]
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,7 @@ def test_other_colours_and_uneven_steps(imported):
         ("a.json", rawtoaces({"400": [1]}, "RGB"), "not like rawtoaces' files"),
         ("a.json", rawtoaces({"red": [1]}, "R"), "not like rawtoaces' files"),
         ("a.json", '{"spectral_data": ', "not valid JSON"),
+        ("a.csv", "wavelength,red\n400,1\n500,1\n", "found red; a colour is one of the letters R"),
         ("a.csv", "wavelength,R,R\n400,1,1\n500,1,1\n", "R twice"),
     ],
 )

@@ -9,6 +9,8 @@ from clpipe.base.errors import RequestError
 from clpipe.base.types import Doubles
 
 Wavelength = Annotated[float, Field(ge=200, le=3000)]  # nm
+LETTERS = "RGBWYCMIL"  # red, green, blue, clear, yellow, cyan, magenta, infrared, no filter
+FILTERS = "lens_transmission", "infrared_cut"
 Share = Annotated[float, Field(ge=0, le=1)]
 Response = Annotated[float, Field(ge=-0.05, le=100)]  # measurements may lie slightly below 0
 
@@ -28,6 +30,7 @@ class Sensitivities(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=2, max_length=2000)]
+    # By the letters of a filter array.
     curves: Annotated[dict[str, tuple[Response, ...]], Field(min_length=1, max_length=8)]
     quantum_efficiencies: bool = False  # whether the curves are electrons per photon
     # Shares of the light that the lens and a filter against infrared pass, at the wavelengths; ()
@@ -39,7 +42,12 @@ class Sensitivities(BaseModel):
     def _check_consistency(self) -> "Sensitivities":
         if np.any(np.diff(self.wavelengths) <= 0):
             raise ValueError("wavelengths must ascend")
-        filters = {name: getattr(self, name) for name in ("lens_transmission", "infrared_cut")}
+        if unknown := self.curves.keys() - {*LETTERS}:
+            raise ValueError(
+                f"curves: found {', '.join(sorted(unknown))}; a colour is one of the letters "
+                f"{', '.join(LETTERS)}"
+            )
+        filters = {name: getattr(self, name) for name in FILTERS}
         tables = {f"curves.{letter}": curve for letter, curve in self.curves.items()}
         for name, curve in (tables | {k: v for k, v in filters.items() if v}).items():
             if len(curve) != len(self.wavelengths):

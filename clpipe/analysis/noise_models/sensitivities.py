@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from clpipe.base.errors import RequestError
 from clpipe.base.validation import first_fault
 from clpipe.camera.profile import Camera, load_camera
-from clpipe.camera.sensitivities import Sensitivities
+from clpipe.camera.sensitivities import FILTERS, Sensitivities
 from clpipe.camera.text import profile_text
 
 MARK = "spectral_data"  # in rawtoaces' JSON
@@ -50,7 +50,8 @@ def parse_rawtoaces(values: Any, path: Path) -> tuple[Sensitivities, str]:
 def parse_csv(text: str, path: Path) -> tuple[Sensitivities, str]:
     """Return the sensitivities of a CSV, and their source.
 
-    The first row has the headings: ``wavelength``, and the letters of the filter array.
+    The first row has the headings: ``wavelength``, and the letters of the filter array. Further
+    columns may be ``lens_transmission`` and ``infrared_cut``.
 
     Raises:
         RequestError: a row has another number of values, or one is not a number.
@@ -67,7 +68,8 @@ def parse_csv(text: str, path: Path) -> tuple[Sensitivities, str]:
             )
     columns = dict(zip(heads, zip(*rows, strict=True), strict=True)) if rows else {}
     wavelengths = columns.pop(heads[0], ())
-    return validated({"wavelengths": wavelengths, "curves": columns}, path), path.name
+    filters = {name: columns.pop(name) for name in FILTERS if name in columns}
+    return validated({"wavelengths": wavelengths, "curves": columns, **filters}, path), path.name
 
 
 def validated(values: Any, path: Path) -> Sensitivities:
