@@ -196,18 +196,40 @@ def test_quantum_efficiencies_lens_and_infrared_cut():
 
 def test_a_light_from_a_file(tmp_path):
     path = tmp_path / "lamp.csv"
-    path.write_text("wavelength,power\n400,0\n500,2\n700,2\n")
-    found = light(str(path))
-    assert found[(GRID < 400) | (GRID > 700)].max() == 0
-    at_450, at_500, at_700 = (found[GRID.searchsorted(nm - 0.05)] for nm in (450, 500, 700))
-    assert at_450 == pytest.approx(at_500 / 2) and at_500 == at_700
-    for text in ("a,b\n", "400,1\n500\n", "500,1\n400,1\n", "400,-1\n500,1\n", "900,1\n950,1\n"):
+    for text in ("wavelength (nm),power\n400,0\n500,2\n\n700,2\n", "#\n700,2\n500,2\n400,0\n,\n"):
         path.write_text(text)
-        with pytest.raises(RequestError, match="not the spectrum of a light"):
+        found = light(str(path))
+        assert found[(GRID < 400) | (GRID > 700)].max() == 0
+        at_450, at_500, at_700 = (found[GRID.searchsorted(nm - 0.05)] for nm in (450, 500, 700))
+        assert at_450 == pytest.approx(at_500 / 2) and at_500 == at_700
+    for text, message in (
+        ("a,b\n", "the eye sees nothing of this light"),
+        ("900,1\n950,1\n", "the eye sees nothing of this light"),
+        ("400,1\n500\n", "row 2: found 500; expected a wavelength"),
+        ("500,1\n500,1\n", "row 2: found 500, 1"),
+        ("400,-1\n500,1\n", "row 1: found 400, -1"),
+        ("400,1\nnan,1\n500,1\n", "row 2: found nan, 1"),
+        ("nm,power\n400,x\n", "row 2: found 400, x"),
+    ):
+        path.write_text(text)
+        with pytest.raises(RequestError, match=message):
             light(str(path))
-    with pytest.raises(RequestError, match=r"D65, F11, LED-B3; or name a CSV"):
-        light("F12")
+    path.write_text("589,1\n")
+    sodium = sight_of(load_camera("sony-a7r2"), str(path))
+    with pytest.raises(RequestError, match="too few wavelengths"):
+        _ = sodium.to_srgb
+    for wrong in ("F12", "lamp.CSV"):
+        with pytest.raises(RequestError, match=r"D65, F11, LED-B3; or name a \.csv file"):
+            light(wrong)
     with pytest.raises(RequestError, match=r"no\.csv: No such file"):
         light("no.csv")
-    with pytest.raises(RequestError, match="no spectral sensitivities"):
+    with pytest.raises(RequestError, match=r"have them: canon-5d2, .* sony-a7s2"):
         sight_of(load_camera("nikon-d800"), "A")
+
+
+def test_a_channel_that_sees_nothing_of_a_lamp():
+    curves = {"R": (0, 1, 0), "G": (1, 0, 0), "B": (0.5, 0, 0), "I": (0, 0, 1)}
+    infrared = Sensitivities(wavelengths=(700, 790, 900), curves=curves)
+    assert Sight(infrared, light("A")).white("I") > 0
+    with pytest.raises(RequestError, match="I of the camera sees nothing of the scene's light"):
+        Sight(infrared, light("LED-B3")).white("I")

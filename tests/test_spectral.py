@@ -1,6 +1,7 @@
 """Spectral renders: bands in files and arrays, through a sensor's filters."""
 
 import json
+import mmap
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 import clpipe
+from clpipe.analysis.noise_models.read import import_camera
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import release_pages
 from clpipe.camera.profile import SRGB_TO_XYZ, load_camera
@@ -17,7 +19,8 @@ from clpipe.chain.making import make_chain
 from clpipe.chain.settings import settings_from
 from clpipe.engine.check import SIZES
 from clpipe.engine.runner import Runner
-from clpipe.images import samples
+from clpipe.explorer.file_names import files_in
+from clpipe.images import claims, samples
 from clpipe.images.claims import claim_of
 from clpipe.images.read import read_image
 from clpipe.images.spectral import spectra_in
@@ -86,8 +89,8 @@ def test_bands_next_to_a_picture_are_named(write):
     image = read_image(write(["R", "G", "B", *BANDS]))
     [warning] = image.warnings
     assert warning == (
-        "its 31 spectral bands from 400 to 700 nm (layer S0) are not used; its R, G and B were "
-        "read. To read the bands, add --layer spectral"
+        "its 31 spectral bands from 400 to 700 nm (layer S0) are not used; to read them, add "
+        "--layer spectral"
     )
 
 
@@ -133,9 +136,51 @@ def test_rejected_bands(names, layer, message, write):
         read_image(write(names), layer=layer)
 
 
+def write_parts(path, *parts):
+    """Write an EXR with parts, each given by its name, its channels and its value."""
+    specs = []
+    for name, channels, _ in parts:
+        spec = oiio.ImageSpec(12, 8, len(channels), oiio.FLOAT)
+        spec.channelnames = channels
+        spec.attribute("oiio:subimagename", name)
+        specs.append(spec)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), tuple(specs))
+    for number, (spec, (_, channels, value)) in enumerate(zip(specs, parts, strict=True)):
+        if number:
+            assert output.open(str(path), spec, "AppendSubimage")
+        output.write_image(np.full((8, 12, len(channels)), value, np.float32))
+    output.close()
+    return path
+
+
+def test_bands_among_parts_and_aovs(tmp_path, write):
+    path, nm = tmp_path / "parts.exr", [f"{nm}nm" for nm in (400, 500, 600, 700)]
+    reflective, emitted = ("T", nm, 3.0), ("S0", nm, 2.0)
+    for parts, layer, value in (
+        ((reflective, emitted), None, 2),
+        ((reflective, emitted), "S0", 2),
+        ((("left", BANDS, 1.0), ("right", BANDS, 2.0)), "right", 2),
+        ((("left", BANDS, 1.0), ("right", BANDS, 2.0)), "right.S0", 2),
+        ((("rgb", list("RGB"), 1.0), ("light", nm, 2.0)), "light", 2),
+        ((("rgb", list("RGB"), 1.0), ("light", nm, 2.0)), "spectral", 2),
+        ((("rgb", list("RGB"), 1.0), ("light", nm, 2.0)), None, 1),
+    ):
+        image = read_image(write_parts(path, *parts), layer=layer)
+        assert (image.pixels == value).all(), (parts, layer)
+        assert bool(image.wavelengths) == (value == 2)
+    [warning] = image.warnings
+    assert "(layer light) are not used; to read them, add --layer spectral" in warning
+    with pytest.raises(ImageError, match="reflectances or parts of polarised"):
+        read_image(write_parts(path, reflective, ("S1", nm, 1.0)))
+    for others in (["albedo.R", "albedo.G", "albedo.B"], ["Y"]):
+        assert len(read_image(write([*BANDS, *others])).wavelengths) == 31
+
+
 def test_attributes_that_are_not_applied(write):
     path = write(BANDS, EV=1.0, cameraResponse="400:1;700:1", generatedBy="Mitsuba version 3.9.1")
     warnings = read_image(path).warnings
+    assert warnings[0] == "its EV, 1.0, is not applied"
     assert [warning.split(",")[0] for warning in warnings] == [
         "its EV",
         "its cameraResponse",
@@ -152,13 +197,34 @@ def test_a_cube_that_is_read_to_disk(half, tiled, write, monkeypatch):
     whole = read_image(path, layer="spectral")
     claim = claim_of(path, layer="spectral")
     assert claim.image == 8 * 12 * 4 * (2 if half else 4)
-    monkeypatch.setattr(samples, "LARGE_CUBE", 100)
-    monkeypatch.setattr(samples, "STRIP", 12 * 7 * 3)  # three rows
+    for module in (samples, claims):
+        monkeypatch.setattr(module, "LARGE_CUBE", 100)
+        monkeypatch.setattr(module, "STRIP", 12 * 7 * 3)  # three rows
     stored = read_image(path, layer="spectral")
+    assert claim_of(path, layer="spectral").image == 12 * 7 * 3 * 4
     assert isinstance(stored.pixels, np.memmap)
     assert stored.pixels.dtype == whole.pixels.dtype == (np.float16 if half else np.float32)
     assert np.array_equal(stored.pixels, whole.pixels)
     assert stored.wavelengths == whole.wavelengths == (400, 500, 600, 700)
+
+
+@pytest.mark.parametrize("overscan", [False, True])
+def test_a_cube_on_the_disk_has_the_display_window(overscan, write_exr, monkeypatch):
+    windows = {"x": -2, "y": 3, "full_width": 9, "full_height": 14}
+    pixels = np.random.default_rng(0).random((8, 12, 5)).astype(np.float32)
+    path = write_exr(
+        "a.exr",
+        pixels,
+        ",".join(name.replace(",", ".") for name in BANDS[:5]),
+        half=False,
+        **windows,
+    )
+    whole = read_image(path, overscan=overscan)
+    monkeypatch.setattr(samples, "LARGE_CUBE", 100)
+    monkeypatch.setattr(samples, "STRIP", 12 * 5)
+    stored = read_image(path, overscan=overscan)
+    assert isinstance(stored.pixels, np.memmap)
+    assert np.array_equal(stored.pixels, whole.pixels) and stored.margins == whole.margins
 
 
 def test_a_cube_that_does_not_fit_on_the_disk(write, monkeypatch):
@@ -166,7 +232,7 @@ def test_a_cube_that_does_not_fit_on_the_disk(write, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(samples, "LARGE_CUBE", 100)
-    monkeypatch.setattr(samples.os, "posix_fallocate", full)
+    monkeypatch.setattr(samples, "reserve", full)
     with pytest.raises(ImageError, match="No space left on device; set TMPDIR"):
         read_image(write(BANDS))
 
@@ -312,10 +378,15 @@ def test_mapped_memory_is_released(tmp_path):
     expected = camera(np.load(path), "a").image
     for mode in ("r", "r+", "c"):
         assert np.array_equal(camera(np.load(path, mmap_mode=mode), "a").image, expected)
-    changed = np.load(path, mmap_mode="c")
-    changed[:] = 0.25  # changes of this mode are only in memory
-    release_pages(changed)
-    assert (changed == 0.25).all()
+    # Changes of a private mapping are only in memory.
+    private = mmap.mmap(-1, 4 * cube(40, 50).size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    for changed in (
+        np.load(path, mmap_mode="c"),
+        np.ndarray((40, 50, 31), np.float32, private),
+    ):
+        changed[:] = 0.25
+        release_pages(changed)
+        assert (changed == 0.25).all()
 
 
 def test_charge_of_a_radiance():
@@ -341,7 +412,7 @@ def test_charge_of_a_radiance():
         photons = 0.002 / energy * etendue * 0.02
         expected = np.trapezoid(photons * scale * curves[colour], nm)
         assert raw[place] == pytest.approx(expected, rel=2e-3)
-    with pytest.raises(RequestError, match="needs spectral bands, but the image is in red"):
+    with pytest.raises(RequestError, match="needs spectral bands, but the image is read as red"):
         clpipe.Pipeline(
             device="numpy", exposure={"method": "radiometric", "quantum_efficiency": 0.5}
         )(np.ones((8, 8, 3), np.float32))
@@ -368,6 +439,54 @@ def test_an_rgb_render_under_lamps(develop):
         assert shot["color_matrix"][8, 8] == pytest.approx(expected, abs=2e-3)
 
 
+def test_what_contradicts_itself():
+    """Spectra that are not read with the sensor's curves have neither a lamp nor a charge."""
+    srgb = {"spectral_response": {"method": "srgb"}, "render": RENDER}
+    for settings, message in (
+        ({**srgb, "render": {**RENDER, "illuminant": "A"}}, "already contain their light"),
+        ({"stages": ["exposure", "spectral_response"], "render": RENDER}, "list it as the first"),
+        (
+            {**mosaic_of("RGBW"), "render": RENDER, "until": "exposure"},
+            "end the chain at",
+        ),
+        ({**mosaic_of("polarised"), "render": RENDER}, "spectra are not polarised"),
+    ):
+        with pytest.raises(RequestError, match=message):
+            clpipe.Pipeline(device="numpy", **settings)
+    radiometric = {"exposure": {"method": "radiometric", "quantum_efficiency": 0.5}}
+    camera = clpipe.Pipeline(device="numpy", **srgb, **radiometric)
+    with pytest.raises(RequestError, match="needs spectral bands, but the image is read as red"):
+        camera(cube(8, 8))
+
+
+def test_methods_are_not_mixed_up():
+    """Chains that differ only in this method are of different families."""
+    pixels, found = cube(8, 8), {}
+    for method in ("xyz", "srgb", "camera", "xyz", "camera"):
+        settings = {"render": RENDER, "spectral_response": {"method": method}}
+        camera = clpipe.Pipeline(device="numpy", until="spectral_response", **settings)
+        assert np.array_equal(found.setdefault(method, camera(pixels).image), camera(pixels).image)
+    assert len({image.tobytes() for image in found.values()}) == 3
+
+
+def test_set_gains_do_not_change_a_raw():
+    gains = {"red_gain": 1.2, "blue_gain": 1.9}
+    for array in ("RGGB", "x-trans", "RCCB", "RGBW"):
+        raws = [
+            clpipe.Pipeline(
+                device="numpy",
+                until="inverse_white_balance",
+                skip=["optical_blur"],
+                render=RENDER,
+                **mosaic_of(array),
+                **set_,
+            )(cube(12, 12) / 8).image
+            for set_ in ({}, {"inverse_white_balance": gains})
+        ]
+        ratio = raws[1] / raws[0]  # arrays are exposed for their most sensitive channel
+        assert ratio == pytest.approx(ratio[0, 0], rel=1e-5), array
+
+
 def test_a_camera_without_sensitivities():
     for render in (RENDER, {"illuminant": "A"}):
         with pytest.raises(RequestError, match=r"nikon-d800: .* spectral_response\.method=srgb"):
@@ -387,11 +506,24 @@ def test_a_camera_without_sensitivities():
     assert np.array_equal(camera(pixels, noise_key="a").image, rgb.image)
 
 
+def test_a_camera_without_red_green_and_blue(tmp_path):
+    path = tmp_path / "curves.csv"
+    path.write_text("wavelength,C,M,Y,G\n400,1,1,0,0\n500,1,0,1,1\n600,0,1,1,0\n700,0,0.5,0.5,0\n")
+    import_camera(path, "sony-a7r2", tmp_path / "cmyg.toml")
+    settings = {"render": RENDER, "skip": ["optical_blur"], **mosaic_of("CMYG")}
+    camera = clpipe.Pipeline(device="numpy", camera=str(tmp_path / "cmyg.toml"), **settings)
+    with pytest.warns(UserWarning, match="not those of red, green and blue, so there is no matrix"):
+        camera(cube(8, 8))
+
+
 def test_bands_that_miss_light():
     with pytest.warns(UserWarning, match=r"its bands from 450 to 600 nm miss \d\d\.\d % of what R"):
         clpipe.Pipeline(device="numpy", render={"wavelengths": (450.0, 500, 550, 600)})(
             cube(8, 8, 4)
         )
+    eye = {"spectral_response": {"method": "srgb"}, "render": {"wavelengths": (500.0, 550, 600)}}
+    with pytest.warns(UserWarning, match=r"miss 7\.8 % of what the eye sees"):
+        clpipe.Pipeline(device="numpy", **eye)(cube(8, 8, 3))
     with pytest.raises(ImageError, match=r"the 31 bands of render\.wavelengths"):
         clpipe.Pipeline(device="numpy", render=RENDER)(cube(8, 8, 3))
     for wrong in ((500.0, 400.0), (500.0,)):
@@ -419,11 +551,51 @@ def test_a_run(write, clpipe):
     assert "same bytes" in clpipe("replay", "out/spectral.json", "-o", "again").output
     for more, message in (
         (("--start-at", "exposure"), "31 spectral bands, with which a chain begins"),
-        (("--set", "render.wavelengths=[400,500]"), "found 2 wavelengths, but the image has 31"),
+        (("--set", "render.wavelengths=[400,500]"), "but the image states those of its 31 bands"),
     ):
         assert message in clpipe("run", path.name, "-o", "no", *more, status=(1, 2)).stderr
     write(["R", "G", "B"])
     assert "needs the bands" in clpipe(*words, *truths, status=(1, 2)).stderr
+
+
+def test_kept_images_go_on(write, clpipe):
+    path = write(BANDS)
+    clpipe("run", path.name, "-o", "out", "--keep", "all", "--format", "png")
+    whole = oiio.ImageBuf("out/spectral.png").get_pixels()
+    for kept, step in (
+        ("spectral_response", "projection"),
+        ("mosaic", "inverse_white_balance"),
+        ("quantize", "normalize"),
+    ):
+        file = f"out/spectral.{kept}.exr"
+        clpipe("run", file, "-o", "on", "--start-at", step, "--format", "png", "--redo", "all")
+        again = oiio.ImageBuf(f"on/spectral.{kept}.png").get_pixels()
+        assert np.array_equal(again, whole), kept
+
+
+def test_light_of_a_chain_without_a_mosaic(write, clpipe):
+    path = write(BANDS)
+    stages = ("--stages", "exposure,tone_curve,gamma", "--set", "spectral_response.method=srgb")
+    clpipe("run", path.name, "-o", "out", *stages, "--truth", "xyz")
+    expected = read_image(path).pixels.astype(np.float64) @ band_weights(observer(), NM)
+    found = oiio.ImageBuf("out/spectral.truth_xyz.exr").get_pixels()
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_subframes_with_other_bands(write_exr, clpipe):
+    for number, shift in enumerate((0, 0, 5)):
+        names = ",".join(f"{nm + shift}nm" for nm in (400, 500, 600, 700))
+        write_exr(f"in/f.{number:04}.exr", np.full((8, 12, 4), 0.5 + number), names, half=False)
+    words = ("run", "in/f.%04d.exr", "-o", "out", "--set", "shutter.subframes=3")
+    message = clpipe(*words, status=1).stderr
+    assert "f.0002.exr: its spectral bands are not those of" in message
+
+
+def test_a_page_names_no_lamp():
+    lamps = {"choice": ["A", "/etc/lamp.csv"]}
+    assert list(files_in({"render": {"illuminant": lamps}})) == [
+        ("render.illuminant", "/etc/lamp.csv")
+    ]
 
 
 def test_a_lamp_drawn_for_each_render(renders, clpipe):
@@ -432,8 +604,8 @@ def test_a_lamp_drawn_for_each_render(renders, clpipe):
     Path("c.toml").write_text(f"[render]\nilluminant = {lamps}\n")
     clpipe("run", renders(8), "-o", "out", "-c", "c.toml", "--format", "png")
     records = [json.loads(path.read_text()) for path in sorted(Path("out").glob("*.json"))]
-    gains = {tuple(record["photometry"]["gains"]["light"]) for record in records}
-    assert 1 < len(gains) <= 3
+    gains = {record["output"]["illuminant"]: record["photometry"]["gains"] for record in records}
+    assert 1 < len(gains) == len({tuple(each["light"]) for each in gains.values()}) <= 3
 
 
 def test_a_dng_has_the_colours_of_two_lights(write, clpipe):

@@ -16,16 +16,16 @@ NO_LIMIT = 2**60  # bytes; without a limit, groups of version 1 report the large
 
 
 def release_pages(array: Any) -> None:
-    """Release the memory of an array that is mapped from a file; its values stay in the file.
+    """Release the memory of an array that NumPy mapped from a file; its values stay in the file.
 
     The system reads them again when they are used. Without this, memory would hold all of a file
     that is larger than the memory. Other arrays do not change.
     """
+    is_shared = False  # with the file; changes of a private mapping are only in memory
     while array is not None and not isinstance(array, mmap):
-        if getattr(array, "mode", "") == "c":
-            return  # its changes are only in memory
+        is_shared |= getattr(array, "mode", "") in ("r", "r+", "w+")
         array = getattr(array, "base", None)
-    if array is not None and hasattr(array, "madvise"):
+    if is_shared and isinstance(array, mmap) and hasattr(array, "madvise"):
         array.madvise(MADV_DONTNEED)
 
 

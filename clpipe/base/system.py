@@ -17,7 +17,7 @@ import threading
 from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 
 def _optional(name: str) -> Any:
@@ -148,7 +148,7 @@ def close_and_remove(path: Path, file: int, first: int, length: int) -> None:
             path.unlink()
 
 
-def reserve(file: BinaryIO, size: int) -> None:
+def reserve(file: IO[bytes], size: int) -> None:
     """Reserve space for a number of bytes in a new file, or check that it is free.
 
     Raises:

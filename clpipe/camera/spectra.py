@@ -4,6 +4,7 @@ All integrals are sums over :data:`GRID`. Curves are linear between their points
 """
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
@@ -11,14 +12,15 @@ from importlib import resources
 
 import numpy as np
 
+from clpipe.base.cache import BoundedCache, Identity
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import read_text
 from clpipe.base.text import unknown_name
 from clpipe.base.types import Doubles
 from clpipe.base.url_text import local_path
 from clpipe.camera.colorimetry import adaptation, lab_of
-from clpipe.camera.profile import SRGB_TO_XYZ, Camera
-from clpipe.camera.sensitivities import Sensitivities
+from clpipe.camera.profile import SRGB_TO_XYZ, Camera, built_in_cameras, load_camera
+from clpipe.camera.sensitivities import LETTERS, Sensitivities
 
 STEP = 0.1  # nm
 GRID = np.linspace(300.0, 1100.0, 8001)  # nm
@@ -76,7 +78,7 @@ def light(name: str) -> Doubles:
         return _named_light(name)
     if not name.endswith(".csv"):
         raise RequestError(
-            f"render.illuminant: {unknown_name('light', name, ILLUMINANTS)}; or name a CSV file "
+            f"render.illuminant: {unknown_name('light', name, ILLUMINANTS)}; or name a .csv file "
             "with rows of wavelength (nm) and power"
         )
     try:
@@ -95,18 +97,32 @@ def _named_light(name: str) -> Doubles:
 
 @lru_cache(maxsize=16)
 def _light_of(text: str, name: str) -> Doubles:
-    rows = [row for row in csv.reader(text.splitlines()) if row and not row[0].startswith("#")]
-    try:
-        nm, power = np.array(rows[1:] if rows and rows[0][0].strip().isalpha() else rows, float).T
-    except ValueError:
-        nm = power = np.zeros(0)
-    spectrum = np.interp(GRID, nm, power, 0, 0) if nm.size else np.zeros(GRID.size)
-    is_valid = np.isfinite(spectrum).all() and spectrum.min() >= 0
-    if not is_valid or np.any(np.diff(nm) <= 0) or spectrum @ observer()[:, 1] <= 0:
-        raise RequestError(
-            f"render.illuminant: {name}: this is not the spectrum of a light. Each row needs a "
-            "wavelength in nm, in ascending order, and a power of 0 or more, some of it visible"
-        )
+    """Return the light of a CSV file. Its first row may be a heading.
+
+    Raises:
+        RequestError: it is not of this form.
+    """
+    points: dict[float, float] = {}
+    for number, row in enumerate(csv.reader(text.splitlines()), 1):
+        cells = [cell.strip() for cell in row if cell.strip()]
+        if not cells or cells[0].startswith("#"):
+            continue
+        try:
+            nm, power = map(float, cells)
+        except ValueError:
+            nm = power = math.nan
+            if not points and number == 1:
+                continue
+        if not (0 < nm < math.inf and 0 <= power < math.inf) or nm in points:
+            raise RequestError(
+                f"render.illuminant: {name}, row {number}: found {', '.join(cells)}; expected a "
+                "wavelength in nm that occurs once, and a power of 0 or more"
+            )
+        points[nm] = power
+    known = sorted(points)
+    spectrum = np.interp(GRID, known or [0.0], [points[nm] for nm in known] or [0.0], 0, 0)
+    if spectrum @ observer()[:, 1] <= 0:
+        raise RequestError(f"render.illuminant: {name}: the eye sees nothing of this light")
     return _scaled(spectrum)
 
 
@@ -149,6 +165,12 @@ def band_weights(curves: Doubles, wavelengths: Sequence[float]) -> Doubles:
     return np.diff(below[cell] + inside, axis=0) * STEP
 
 
+def missed_by(wavelengths: Sequence[float], curve: Doubles) -> float:
+    """Return the share of a curve on the grid that is outside of bands."""
+    low, *_, high = band_edges(wavelengths)
+    return float(curve[(low > GRID) | (high < GRID)].sum() / curve.sum())
+
+
 @dataclass(frozen=True, eq=False)
 class Sight:
     """A sensor in the light of a scene.
@@ -167,17 +189,23 @@ class Sight:
     sensitivities: Sensitivities
     light: Doubles
 
+    @cached_property
+    def _curves(self) -> dict[str, Doubles]:
+        return dict(zip(self.sensitivities.curves, self.sensitivities.at(GRID).T, strict=True))
+
     def response(self, channel: str) -> Doubles:
         """Return a channel's response to energy on the grid.
 
         Raises:
             RequestError: the sensitivities have no curve from which it follows.
         """
-        curves = dict(zip(self.sensitivities.curves, self.sensitivities.at(GRID).T, strict=True))
+        curves = self._curves
         if channel in curves:
             return curves[channel]
         dyes = DYES.get(channel, channel)
         if missing := [letter for letter in dyes if letter not in curves]:
+            if missing[0] not in LETTERS:
+                raise RequestError("spectra are not polarised, so a sensor needs other filters")
             raise RequestError(
                 f"the camera's sensitivities have curves for {', '.join(curves)}, but not for "
                 f"{missing[0]}, which the filter array needs; add this curve to the profile, or "
@@ -186,8 +214,18 @@ class Sight:
         return np.asarray(sum(curves[letter] for letter in dyes))
 
     def white(self, channel: str) -> float:
-        """Return a channel's response to white."""
-        return float(self.response(channel) @ self.light) * STEP
+        """Return a channel's response to white.
+
+        Raises:
+            RequestError: as for :meth:`response`, or the channel sees nothing of the light.
+        """
+        found = float(self.response(channel) @ self.light) * STEP
+        if found <= 0:
+            raise RequestError(
+                f"{channel} of the camera sees nothing of the scene's light; set another "
+                "render.illuminant, or choose another mosaic"
+            )
+        return found
 
     @cached_property
     def has_colours(self) -> bool:
@@ -237,7 +275,13 @@ class Sight:
             slopes = [(error(found + step) - now) / 1e-6 for step in 1e-6 * np.eye(6)]
             found = found - np.linalg.lstsq(np.stack(slopes, -1), now, rcond=None)[0]
         red, blue = found.reshape(2, 3)
-        return np.stack([red, 1 - red - blue, blue], axis=-1)
+        matrix = np.stack([red, 1 - red - blue, blue], axis=-1)
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
+            raise RequestError(
+                "render.illuminant: this light has too few wavelengths, so the camera sees no "
+                "colours; set another light"
+            )
+        return matrix
 
     @cached_property
     def from_srgb(self) -> Doubles:
@@ -259,12 +303,6 @@ class Sight:
         curves = np.stack([self.response(c) / self.white(c) for c in channels], axis=-1)
         return band_weights(curves, wavelengths)
 
-    def missed(self, wavelengths: Sequence[float], channel: str) -> float:
-        """Return the share of a channel's response to white outside of the bands."""
-        curve = self.response(channel) * self.light
-        low, *_, high = band_edges(wavelengths)
-        return float(curve[(low > GRID) | (high < GRID)].sum() / curve.sum())
-
     def electrons(self, channel: str, efficiency: float | None) -> float:
         """Return a channel's charge per second for white, e- over the etendue in m2 sr.
 
@@ -282,10 +320,7 @@ class Sight:
         return self.white(channel) * scale / PLANCK_TIMES_LIGHT_SPEED
 
 
-@lru_cache(maxsize=64)
-def _sight(text: str, light_bytes: bytes) -> Sight:
-    sensitivities = Sensitivities.model_validate_json(text)
-    return Sight(sensitivities, np.frombuffer(light_bytes))
+SIGHTS: BoundedCache[Sight] = BoundedCache(64)
 
 
 def sight_of(camera: Camera, illuminant: str) -> Sight:
@@ -294,12 +329,14 @@ def sight_of(camera: Camera, illuminant: str) -> Sight:
     Raises:
         RequestError: the camera's profile has no sensitivities, or the light is unknown.
     """
-    spectrum = light(illuminant)
-    if camera.sensitivities is None:
+    spectrum, sensitivities = light(illuminant), camera.sensitivities
+    if sensitivities is None:
+        known = [name for name in built_in_cameras() if load_camera(name).sensitivities]
         raise RequestError(
             f"camera {camera.name}: its profile has no spectral sensitivities, which spectra and "
-            "render.illuminant need. 'clpipe cameras' lists the cameras that have them, and "
-            "'clpipe cameras import' adds them to a profile. To read a spectral render as one in "
-            "sRGB, set spectral_response.method=srgb"
+            f"render.illuminant need. These cameras have them: {', '.join(known)}. 'clpipe cameras "
+            "import' adds them to a profile. To read a spectral render as one in sRGB, set "
+            "spectral_response.method=srgb"
         )
-    return _sight(camera.sensitivities.model_dump_json(), spectrum.tobytes())
+    key = Identity(sensitivities), Identity(spectrum)
+    return SIGHTS.get(key, lambda: Sight(sensitivities, spectrum))

@@ -8,6 +8,7 @@ import numpy as np
 
 from clpipe.base.errors import RequestError
 from clpipe.base.types import Array
+from clpipe.camera.spectra import DEFAULT_ILLUMINANT, light, missed_by, observer
 from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.chain.keys import RENDER
 from clpipe.chain.layers import layer_steps, layer_warnings, reads_layers, with_layers
@@ -22,6 +23,7 @@ from clpipe.reference.panorama import Panorama
 from clpipe.stage import ImageLayer, StageRole
 from clpipe.stage.method import parameters_with
 from clpipe.stages.exposure.radiometric import Radiometric
+from clpipe.stages.spectral_response import CameraResponse
 
 MISSED = 0.01  # share of a channel's white outside of the bands, above which there is a warning
 
@@ -65,11 +67,11 @@ def prepare_image(
         RequestError: the camera's values contradict each other, or a step cannot use its layer or
             the image.
     """
-    if not chain.bands and needs_bands(chain):
+    if lacks_radiance(chain):
         raise RequestError(
             f"{stage_in(StageRole.EXPOSURE).name}.method={Radiometric.method}: this method needs "
-            "spectral bands, but the image is in red, green and blue. For a render in cd/m2, use "
-            "photometric. To read a file's bands, add --layer spectral"
+            "spectral bands, but the image is read as red, green and blue. For a render in cd/m2, "
+            "use photometric. To read a file's bands, add --layer spectral"
         )
     if chain.step_names[0] == chain.names[0] and pixels.ndim == 3:
         width, height = margins.frame_size(*pixels.shape[1::-1])
@@ -104,44 +106,58 @@ def with_bands(chain: Chain, wavelengths: tuple[float, ...]) -> Chain:
     Raises:
         RequestError: the settings state other bands, or the chain starts at a later step.
     """
-    stated = chain.settings.render.wavelengths
-    if wavelengths == stated:
+    stated, is_whole = chain.settings.render.wavelengths, chain.step_names[0] == chain.names[0]
+    if wavelengths == stated or (not wavelengths and not is_whole):
         return chain
-    if not wavelengths or stated:
-        found = f"{len(wavelengths)} bands" if wavelengths else "red, green and blue"
+    if not wavelengths:
         raise RequestError(
-            f"render.wavelengths: found {len(stated)} wavelengths, but the image has {found}, and "
-            "states their wavelengths itself; remove render.wavelengths"
+            f"render.wavelengths: found {len(stated)} wavelengths, but the image has red, green "
+            "and blue; remove render.wavelengths"
         )
-    if chain.step_names[0] != chain.names[0]:
+    if stated:
+        raise RequestError(
+            f"render.wavelengths: found {len(stated)} wavelengths, but the image states those of "
+            f"its {len(wavelengths)} bands itself; remove render.wavelengths"
+        )
+    if not is_whole:
         raise RequestError(
             f"--start-at {chain.step_names[0]}: the image has {len(wavelengths)} spectral bands, "
-            "with which a chain begins; remove --start-at, or add --layer RGB"
+            "with which a chain begins; remove --start-at"
         )
     settings = overlay(chain.settings, {RENDER: {"wavelengths": wavelengths}})
     return make_chain(settings, chain.source, until=chain.steps[-1].name)
 
 
 @cached_by_structure
-def needs_bands(chain: Chain) -> bool:
-    """Return whether the exposure of a chain is computed from spectra."""
-    return any(isinstance(step.method, Radiometric) for step in chain.steps)
+def lacks_radiance(chain: Chain) -> bool:
+    """Return whether a chain lacks the spectra from which its exposure is computed."""
+    is_needed = any(isinstance(step.method, Radiometric) for step in chain.steps)
+    return is_needed and not isinstance(chain.steps[0].method, CameraResponse)
 
 
+@lru_cache(maxsize=64)
 def bands_warning(chain: Chain) -> str:
-    """Return a warning if the bands of a render miss light that the sensor sees; "" if not."""
+    """Return a warning about the bands of a spectral render; "" if there is nothing to tell."""
     context = chain.steps[0].context
-    if context.sight is None:
-        return ""
-    array, nm = context.array_ahead, context.wavelengths
-    missed = {channel: context.sight.missed(nm, channel) for channel in array.channels}
-    worst = max(missed, key=lambda channel: missed[channel])
-    if missed[worst] < MISSED:
-        return ""
-    return (
-        f"its bands from {nm[0]:g} to {nm[-1]:g} nm miss {100 * missed[worst]:.1f} % of what "
-        f"{worst} sees of white; render more bands"
-    )
+    nm, sight = context.wavelengths, context.sight
+    curves = {"the eye": observer()[:, 1] * light(DEFAULT_ILLUMINANT)}
+    if sight:
+        channels = context.array_ahead.channels
+        curves = {c: sight.response(c) * sight.light for c in channels}
+    missed = {name: missed_by(nm, curve) for name, curve in curves.items()}
+    worst = max(missed, key=lambda name: missed[name])
+    texts = []
+    if missed[worst] > MISSED:
+        texts.append(
+            f"its bands from {nm[0]:g} to {nm[-1]:g} nm miss {100 * missed[worst]:.1f} % of what "
+            f"{worst} sees of white; render more bands"
+        )
+    if sight and not sight.has_colours and len(curves) > 1:
+        texts.append(
+            f"the sensitivities of camera {chain.camera.name} are not those of red, green and "
+            "blue, so there is no matrix to sRGB; set one"
+        )
+    return "; ".join(texts)
 
 
 @lru_cache(maxsize=64)

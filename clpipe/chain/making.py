@@ -109,8 +109,7 @@ def entry_kind(settings: Settings) -> Kind:
 def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list[Step]:
     """Return the steps of settings in order, each resolved in the context after the earlier steps.
 
-    A step that does nothing is skipped if its image kind does not fit. The first step of a spectral
-    render is the spectral response, whether or not the settings list it.
+    A step that does nothing is skipped if its image kind does not fit.
 
     Args:
         settings: all values that are set.
@@ -120,7 +119,7 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
     Raises:
         RequestError: the image kinds of two stages do not fit.
     """
-    methods = {name: settings.method(name) for name in step_names_of(settings)}
+    methods = {name: settings.method(name) for name in settings.step_names}
     optics = optics_of(settings, camera, methods)
     time = optics.exposure_time
     sight, render = sight_of_render(settings, camera, methods), settings.render
@@ -181,28 +180,24 @@ def resolve_steps(settings: Settings, camera: Camera, kind: Kind | None) -> list
     return steps
 
 
-def step_names_of(settings: Settings) -> tuple[str, ...]:
-    """Return the names of the steps; a spectral render has the spectral response before them."""
-    if not settings.render.wavelengths:
-        return settings.step_names
-    spectral = stage_in(StageRole.SPECTRUM).name
-    added = () if spectral in (*settings.stages, *settings.skip) else (spectral,)
-    return *added, *settings.step_names
-
-
 def sight_of_render(
     settings: Settings, camera: Camera, methods: Mapping[str, Method]
 ) -> Sight | None:
     """Return the camera's sight in the light of a render; None if spectra do not matter.
 
     Raises:
-        RequestError: the camera has no sensitivities, or the light is unknown.
+        RequestError: the camera has no sensitivities, or the light is unknown or not used.
     """
     render = settings.render
     if not render.illuminant and not render.wavelengths:
         return None
-    sees = isinstance(methods.get(stage_in(StageRole.SPECTRUM).name), CameraResponse)
-    if not render.illuminant and not sees:
+    name = stage_in(StageRole.SPECTRUM).name
+    if render.wavelengths and not isinstance(methods.get(name), CameraResponse):
+        if render.illuminant:
+            raise setting_error(
+                f"render.illuminant: found {render.illuminant}, but spectra that are not read with "
+                f"{name}.method=camera already contain their light; remove it"
+            )
         return None
     return sight_of(camera, render.illuminant or DEFAULT_ILLUMINANT)
 

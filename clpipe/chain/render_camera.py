@@ -67,7 +67,7 @@ class RenderCamera(BaseModel):
     @property
     def optics(self) -> dict[str, float]:
         """The optics that are set, by field name."""
-        return self.model_dump(exclude=POSE, exclude_none=True)
+        return self.model_dump(exclude=POSE | SPECTRA, exclude_none=True)
 
     def with_defaults(self, shot: Mapping[str, float]) -> "RenderCamera":
         """Return a copy whose fields that are None are filled from ``shot``, an image's own values.
@@ -80,4 +80,5 @@ class RenderCamera(BaseModel):
         return self.model_copy(update={k: v for k, v in shot.items() if k not in set_fields})
 
 
-POSE = {"rotation", "translation", "motion", "wavelengths", "illuminant"}
+POSE = {"rotation", "translation", "motion"}
+SPECTRA = {"wavelengths", "illuminant"}

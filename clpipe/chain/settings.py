@@ -45,11 +45,11 @@ from clpipe.chain.methods import (
     unknown_parameter,
 )
 from clpipe.chain.paths import file_parameters, resolve_paths
-from clpipe.chain.registry import all_stages
+from clpipe.chain.registry import all_stages, stage_in
 from clpipe.chain.render_camera import RenderCamera
 from clpipe.images.dump import Dump, parse_dump
 from clpipe.images.encoding import Encoding
-from clpipe.stage import Method
+from clpipe.stage import Method, StageRole
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,16 @@ class Settings(PlainSettings):
     def step_names(self) -> tuple[str, ...]:
         """The names of the steps that are not skipped. A repeated stage gets a number.
 
+        The bands of a spectral render are added up first, whether or not that stage is listed.
+
         >>> Settings(stages=("exposure", "mosaic", "exposure"), skip=("mosaic",)).step_names
         ('exposure', 'exposure_2')
         """
-        return step_names(self.stages, self.skip)
+        names = step_names(self.stages, self.skip)
+        if not self.render.wavelengths:
+            return names
+        spectral = stage_in(StageRole.SPECTRUM).name
+        return names if spectral in (*self.stages, *self.skip) else (spectral, *names)
 
     @property
     def named_lens(self) -> str:

@@ -49,18 +49,32 @@ def with_enough_planes(chain: Chain) -> Chain:
     """Return the chain with one sum for each site if the filter array has too many channels.
 
     Raises:
-        KeyedError: a step before the mosaic needs all channels of a pixel.
+        KeyedError: a step before the mosaic needs all channels of a pixel, or the chain reads bands
+            after its first step.
     """
-    between = steps_to_mosaic(chain)
-    if between is None or chain.steps[1].context.planes:
+    for step in chain.steps[1:]:
+        if step.stage.role is StageRole.SPECTRUM and step.passes:
+            raise KeyedError(
+                step.name, f"{step.name}: it reads the render itself; list it as the first stage"
+            )
+    first = chain.steps[0]
+    if not chain.bands or first.method.next_context(first.context).planes:
         return chain
+    array, between = first.context.array_ahead, steps_to_mosaic(chain)
+    channels = ", ".join(array.channels)
+    if between is None:
+        last = chain.steps[-1].name
+        raise KeyedError(
+            last,
+            f"{last}: of a spectral render at most three channels are computed before the mosaic, "
+            f"and {array.name} has {channels}; end the chain at the mosaic or later",
+        )
     for step in between:
         if not _is_by_pixel(step):
-            array = chain.steps[0].context.array_ahead
             raise KeyedError(
                 step.name,
                 f"{step.name}.method={step.method.method}: this step before the mosaic needs all "
                 f"channels of a pixel, but of a spectral render at most three are computed, and "
-                f"{array.name} has {', '.join(array.channels)}; skip {step.name}",
+                f"{array.name} has {channels}; skip {step.name}",
             )
     return with_site_sums(chain)

@@ -43,12 +43,11 @@ def light_of(truth: str, chain: Chain) -> Chain:
             f"--truth {truth}: this truth needs the bands of a spectral render, but the image is "
             "in red, green and blue; remove it"
         )
-    roles = [step.stage.role for step in chain.steps]
-    end = roles.index(StageRole.PATTERN) if StageRole.PATTERN in roles else len(roles)
-    sensor = (StageRole.EXPOSURE, StageRole.COLOURS_OF_LIGHT)
-    first, *others = chain.steps[:end]
+    before = takewhile(lambda step: step.stage.role is not StageRole.PATTERN, chain.steps)
+    first, *others = before
     observer = (ToXyz if truth == XYZ else ToSrgb)().resolve(first.context)
-    kept = [step for step in others if step.stage.role not in sensor]
+    optics = StageRole.VIEW, StageRole.SHUTTER, StageRole.LENS, StageRole.FALLOFF
+    kept = [s for s in others if s.stage.role in optics or s.method.geometry()]
     return replace(chain, steps=(replace(first, method=observer), *kept))
 
 

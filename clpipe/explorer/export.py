@@ -7,11 +7,13 @@ from typing import Any
 
 from clpipe.chain.files import config_text
 from clpipe.chain.keys import KEYS, TABLES
+from clpipe.chain.registry import stage_in
 from clpipe.chain.request import Request
 from clpipe.chain.toml import value_text
 from clpipe.explorer.explorer import Explorer
 from clpipe.images.pixels import DEFAULT_MAX_PIXELS
 from clpipe.inputs.find import Job
+from clpipe.stage import StageRole
 
 OUT = "out"  # the output directory in the commands
 SAVED = "camera.toml"  # the file name of a saved configuration
@@ -24,7 +26,7 @@ def exported(explorer: Explorer, image: int, values: Mapping[str, Any]) -> dict[
         ClpipeError: a value is not allowed.
     """
     request = explorer.request(values)
-    steps = request.settings().step_names
+    steps = (*request.settings().step_names, stage_in(StageRole.SPECTRUM).name)
     used = {key: v for key, v in values.items() if key in (*KEYS, *TABLES, *steps)}
     job, reading = explorer.job(image), _reading_options(request)
     files = [Path(file) for file in request.stage_files]

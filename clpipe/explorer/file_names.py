@@ -5,6 +5,8 @@ from typing import Any
 
 from clpipe.base.errors import KeyedError
 from clpipe.camera.profile import built_in_name
+from clpipe.camera.spectra import ILLUMINANTS
+from clpipe.chain.keys import RENDER
 from clpipe.chain.methods import base_name
 from clpipe.chain.paths import file_parameters
 from clpipe.chain.registry import all_stages
@@ -22,6 +24,11 @@ def files_in(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         stage = all_stages().get(base_name(key))
         if key == "camera":
             yield from ((key, name) for name in texts_in(value) if not built_in_name(name))
+        elif key == RENDER and isinstance(value, Mapping):
+            lamps = texts_in(value.get("illuminant", ""))
+            yield from (
+                (f"{key}.illuminant", lamp) for lamp in lamps if lamp not in ("", *ILLUMINANTS)
+            )
         elif isinstance(value, Mapping) and stage:
             for name in sorted(file_parameters(stage) & value.keys()):
                 yield from ((f"{key}.{name}", text) for text in texts_in(value[name]) if text)

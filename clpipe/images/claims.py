@@ -1,5 +1,6 @@
 """Reads the image size from a file's header, and estimates the memory to read its pixels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from clpipe.base.errors import ImageError
 from clpipe.images.clip_frames import clip_of, clip_size
 from clpipe.images.colour import CIE_XYZ, SRGB, to_linear_srgb
 from clpipe.images.colour_names import space_of
-from clpipe.images.layers import find_picture, is_spectral, picture_channels
+from clpipe.images.layers import find_picture, picture_channels
 from clpipe.images.openexr import MAX_EXTRA
 from clpipe.images.openimageio import open_image
 from clpipe.images.raw import RAW_SUFFIXES, raw_size
@@ -87,7 +88,12 @@ def claim_of(path: Path, mosaic: bool = False, layer: str | None = None) -> Memo
         if path.suffix.lower() in RAW_SUFFIXES:
             return mosaic_claim(*raw_size(path))
         with open_image(path) as file:
-            return _claim(file.spec(), file.format_name() == "openexr", mosaic, layer)
+            if not mosaic and (layer or spectra_in(file.spec().channelnames)):
+                location = find_picture(path, file, mosaic, layer)
+                if location.wavelengths:
+                    return _cube_claim(file.spec(), location.channels)
+                file.seek_subimage(0, 0)
+            return _claim(file.spec(), file.format_name() == "openexr", mosaic)
     except ImageError:
         return None
 
@@ -103,18 +109,24 @@ def bands_in(path: Path, layer: str | None) -> tuple[float, ...]:
         return ()  # reading the image says why
 
 
-def _claim(spec: Any, is_exr: bool, mosaic: bool, layer: str | None) -> MemoryClaim:
+def _cube_claim(spec: Any, channels: Sequence[int]) -> MemoryClaim:
+    """Return the claim of a spectral cube, which may be read to disk."""
+    width, height = max(spec.width, spec.full_width), max(spec.height, spec.full_height)
+    formats = spec.channelformats or [spec.format] * spec.nchannels
+    samples = width * height * len(channels)
+    size = samples * max(formats[i].size() for i in channels)
+    if samples > LARGE_CUBE:
+        size = STRIP * FLOAT
+    return MemoryClaim(width, height, size, 2 * size)
+
+
+def _claim(spec: Any, is_exr: bool, mosaic: bool) -> MemoryClaim:
     width, height = max(spec.width, spec.full_width), max(spec.height, spec.full_height)
     formats = spec.channelformats or [spec.format] * spec.nchannels
     picture = None if mosaic else picture_channels(list(spec.channelnames))
-    spectra = [] if mosaic else spectra_in(spec.channelnames)
-    if spectra and is_spectral(layer, {0: spectra}, picture is not None):
-        picture = spectra[0].layer, spectra[0].channels
-        if len(picture[1]) * spec.width * spec.height > LARGE_CUBE:
-            return MemoryClaim(width, height, STRIP * FLOAT, 2 * STRIP * FLOAT)
     picture_formats = [formats[i] for i in picture[1]] if picture else formats
     sample = 2 if is_exr and all(each.size() == 2 for each in picture_formats) else FLOAT
-    image = sample * (1 if mosaic else len(picture[1]) if picture else 3)
+    image = sample * (1 if mosaic else 3)
     stored = sum(each.size() for each in formats)
     # The package OpenEXR decodes all channels, from which the requested ones are copied.
     extra = 0 if stored == image else min(stored, MAX_EXTRA * image)

@@ -1,8 +1,8 @@
 """Finds the picture of a file among its parts, layers and channels."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class PictureLocation:
         view: the number of the view in a stereo picture.
         name: the name of the layer, without the view's name.
         wavelengths: of the bands of a spectral picture, nm; its channels are these bands.
+        unread: spectra in the file that are not this picture.
     """
 
     part: int
@@ -60,6 +61,7 @@ class PictureLocation:
     view: int = 0
     name: str = ""
     wavelengths: tuple[float, ...] = ()
+    unread: tuple[Spectrum, ...] = ()
 
     @property
     def rank(self) -> tuple[bool, int, int]:
@@ -95,7 +97,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     channel_names: list[str] = []
     rejections: list[str] = []
     views: list[str] = []
-    spectra: dict[int, list[Spectrum]] = {}  # by part
+    spectra: list[Spectrum] = []
     for part, part_name, spec in parts_of(file):
         if part >= MAX_PARTS:
             raise ImageError(
@@ -109,8 +111,12 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         is_kept = "kind" in clpipe_attributes(spec)
         views += stated_views(spec)
         channel = mosaic_channel(names) if mosaic else None
-        if not mosaic and (found_spectra := spectra_in(names)):
-            spectra[part] = found_spectra
+        for spectrum in () if mosaic else spectra_in(names):
+            full = full_name(part_name, spectrum.layer)
+            rejections += (problem := _integer_problem(spec, full, spectrum.channels))
+            if not problem:
+                view, name = view_of(full, views)
+                spectra.append(replace(spectrum, layer=full, part=part, view=view, name=name))
         found = [] if mosaic else list(_layers(names, is_kept))
         if is_kept and not (found or channel):
             raise KindError(path, clpipe_attributes(spec))
@@ -123,33 +129,48 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
                 pictures.append(PictureLocation(part, full, channels, xyz, view, name))
     if not pictures and rejections:
         raise ImageError(f"{path}: {rejections[0]}")
-    if spectra and is_spectral(layer, spectra, bool(pictures)):
-        part, layers = next(iter(spectra.items()))
-        light = light_in(path, layers, layer)
-        file.seek_subimage(part, 0)
-        file.geterror()
-        return PictureLocation(
-            part, light.layer, light.channels, name=light.layer, wavelengths=light.wavelengths
-        )
-    if not pictures:
-        listed = ", ".join(name for name in channel_names[:20] if name) or "none"
-        missing = "several channels, but a mosaic has one" if mosaic else "no R, G and B channels"
-        advice = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"
-        raise NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", advice)
-    best = _preferred(path, pictures) if layer is None else _picture_in_layer(path, pictures, layer)
+    if chosen := spectra_to_read(layer, spectra, pictures):
+        best = _location_of(light_in(path, chosen, layer))
+    elif not pictures:
+        raise _no_picture(path, channel_names, mosaic)
+    else:
+        named = layer is not None and _picture_in_layer(path, pictures, layer)
+        best = replace(named or _preferred(path, pictures), unread=tuple(spectra))
     file.seek_subimage(best.part, 0)
     file.geterror()  # clears the error: the loop asked for levels that do not exist
     return best
 
 
-def is_spectral(
-    layer: str | None, spectra: Mapping[int, Sequence[Spectrum]], has_picture: bool
-) -> bool:
-    """Return whether the bands of a file are read, not its R, G and B."""
+def spectra_to_read(
+    layer: str | None, spectra: Sequence[Spectrum], pictures: Sequence[PictureLocation]
+) -> list[Spectrum]:
+    """Return the spectra of a file among which the light is; [] if its picture is read."""
     if layer is None:
-        return not has_picture
-    named = {each.layer.lower() for layers in spectra.values() for each in layers}
-    return layer.lower() in named - {""} | {SPECTRAL}
+        has_colours = any(len(each.channels) == 3 and not each.is_aov for each in pictures)
+        return [] if has_colours else [*spectra]
+    if layer.lower() == SPECTRAL:
+        return [*spectra]
+    is_picture = any(each.layer.lower() == layer.lower() for each in pictures)
+    return [] if is_picture else [each for each in spectra if each.is_in(layer)]
+
+
+def _location_of(spectrum: Spectrum) -> PictureLocation:
+    return PictureLocation(
+        spectrum.part,
+        spectrum.layer,
+        spectrum.channels,
+        view=spectrum.view,
+        name=spectrum.name,
+        wavelengths=spectrum.wavelengths,
+    )
+
+
+def _no_picture(path: Path, channel_names: Sequence[str], mosaic: bool) -> NoPictureError:
+    """Return the error for a file without a picture."""
+    listed = ", ".join(name for name in channel_names[:20] if name) or "none"
+    missing = "several channels, but a mosaic has one" if mosaic else "no R, G and B channels"
+    advice = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"
+    return NoPictureError(f"{path}: there are {missing}; found {printable(listed)}", advice)
 
 
 def stated_views(spec: Any) -> list[str]:

@@ -29,6 +29,7 @@ from clpipe.images.pixels import (
     windows_overlap,
 )
 from clpipe.images.samples import WAYS, digest_of, read_part, read_samples, with_digest
+from clpipe.images.spectral import SPECTRAL
 from clpipe.images.statements import Statements, over_black, read_statements
 from clpipe.reference.geometry import NO_MARGINS, Margins
 from clpipe.reference.panorama import Panorama
@@ -365,6 +366,11 @@ def _decode(
                 alpha = read_samples(path, file, location.part, [stated.alpha], oiio.FLOAT)
                 pixels = over_black(pixels, alpha[..., 0])
             pixels = stated.upright(pixels)
+        unread = [
+            f"its {each} are not used; to read them, add --layer {SPECTRAL}"
+            for each in location.unread
+        ]
+        stated = replace(stated, warnings=(*unread, *stated.warnings))
         image = SourceImage(
             *(pixels, digest, location.layer, (), clpipe_attributes(spec), shot_attributes(spec)),
             margins=margins,

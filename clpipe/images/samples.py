@@ -1,11 +1,10 @@
 """Reads samples and single values from image files, and computes digests of the files."""
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from math import prod
 from pathlib import Path
-from tempfile import TemporaryFile, gettempdir
+from tempfile import NamedTemporaryFile, gettempdir
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from clpipe.base.digests import digests, stamp_of
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sha256_of
 from clpipe.base.memory import release_pages
+from clpipe.base.system import reserve
 from clpipe.base.types import Array
 from clpipe.images.layers import PictureLocation, mosaic_channel, picture_channels
 from clpipe.images.openexr import read_channels
@@ -57,43 +57,57 @@ def read_samples(path: Path, file: Any, part: int, channels: Sequence[int], type
     return pixels if order == list(range(last - first)) else pixels[..., order]
 
 
-def read_to_disk(path: Path, file: Any, location: PictureLocation, type_: Any) -> Array:
-    """Return the bands of a part's data window like :func:`read_samples`, as a view of planes.
+def read_to_disk(
+    path: Path,
+    file: Any,
+    location: PictureLocation,
+    type_: Any,
+    size: tuple[int, int],
+    position: tuple[int, int],
+) -> Array:
+    """Return the bands of a part in a window, as a view of planes in a file without a name.
 
-    The planes are in a file that has no name any more, so they may be larger than the memory.
+    Args:
+        path: the file, for messages.
+        file: the open ``oiio.ImageInput``, at the part.
+        location: the bands.
+        type_: the type of the samples, half or float.
+        size: the width and height of the window. Outside the data, it is 0.
+        position: the column and row of the data's upper left pixel in it.
 
     Raises:
         ImageError: the part is damaged, or the disk is full.
     """
     spec, channels = file.spec(), location.channels
     first, last = min(channels), max(channels) + 1
-    order = [i - first for i in channels]
-    step = spec.tile_height or max(1, STRIP // (spec.width * (last - first)))
-    dtype = np.float16 if type_ == oiio.HALF else np.float32
-    shape = len(channels), spec.height, spec.width
-    with TemporaryFile() as scratch:
+    dtype = np.dtype(np.float16 if type_ == oiio.HALF else np.float32)
+    shape = len(channels), size[1], size[0]
+    with NamedTemporaryFile() as scratch:
         try:
-            os.posix_fallocate(scratch.fileno(), 0, prod(shape) * np.dtype(dtype).itemsize)
+            reserve(scratch.file, prod(shape) * dtype.itemsize)
+            planes = np.memmap(scratch, dtype, "r+", shape=shape)
         except OSError as error:
             raise ImageError(
                 f"{path}: its bands do not fit into {gettempdir()}: {error.strerror}; set TMPDIR "
                 "to a folder with more space"
             ) from None
-        planes = np.memmap(scratch, dtype, "r+", shape=shape)
-    for y in range(0, spec.height, step):
-        rows = min(step, spec.height - y)
-        top, bottom = spec.y + y, spec.y + y + rows
+    (x, y), step = position, spec.tile_height or max(1, STRIP // (spec.width * (last - first)))
+    columns = slice(max(x, 0), min(x + spec.width, size[0]))
+    for row in range(0, spec.height, step):
+        top, bottom = spec.y + row, spec.y + min(row + step, spec.height)
+        ranges = (top, bottom, spec.z, *([spec.z + 1] if spec.tile_width else []), first, last)
         if spec.tile_width:
-            columns = spec.x, spec.x + spec.width
-            samples = file.read_tiles(
-                *(location.part, 0, *columns, top, bottom, spec.z, spec.z + 1, first, last, type_)
-            )
+            samples = file.read_tiles(location.part, 0, spec.x, spec.x + spec.width, *ranges, type_)
         else:
-            samples = file.read_scanlines(location.part, 0, top, bottom, spec.z, first, last, type_)
+            samples = file.read_scanlines(location.part, 0, *ranges, type_)
         if samples is None:
             raise ImageError(f"{path}: {damage_text(file.geterror())}")
-        samples = samples.reshape(rows, spec.width, last - first)
-        planes[:, y : y + rows] = samples.transpose(2, 0, 1)[order]
+        samples = samples.reshape(bottom - top, spec.width, last - first)
+        rows = slice(max(y + row, 0), min(y + row + bottom - top, size[1]))
+        if rows.start < rows.stop:
+            inside = samples[rows.start - y - row : rows.stop - y - row]
+            inside = inside[:, columns.start - x : columns.stop - x, [c - first for c in channels]]
+            planes[:, rows, columns] = inside.transpose(2, 0, 1)
         release_pages(planes)
     return planes.transpose(1, 2, 0)
 
@@ -131,15 +145,15 @@ def read_part(
     # Whole numbers keep their type, because OpenImageIO would scale them to 0..1 as floats.
     type_ = types.pop() if is_integer else oiio.HALF if types == {oiio.HALF} else oiio.FLOAT
     pixels = None
-    if location.wavelengths and spec.width * spec.height * len(channels) > LARGE_CUBE:
-        pixels = read_to_disk(path, file, location, type_)
-    elif file.format_name() == "openexr" and not is_integer:
+    position = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
+    if location.wavelengths and width * height * len(channels) > LARGE_CUBE:
+        return read_to_disk(path, file, location, type_, (width, height), position)
+    if file.format_name() == "openexr" and not is_integer:
         pixels = read_channels(path, file, channels)
     if pixels is None:
         pixels = read_samples(path, file, location.part, channels, type_)
     if is_integer:
         pixels = pixels.astype(np.float32)
-    position = spec.x - spec.full_x + margins.left, spec.y - spec.full_y + margins.top
     if (*position, spec.width, spec.height) != (0, 0, width, height):
         pixels = display_window(pixels, *position, width, height)
     return pixels if len(channels) > 1 else np.ascontiguousarray(pixels[..., 0])

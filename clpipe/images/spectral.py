@@ -33,12 +33,28 @@ class Spectrum:
     Args:
         layer: its name; "" if the channels have none.
         wavelengths: of the bands, nm.
-        channels: their numbers in the file.
+        channels: their numbers in the part.
+        part: the number of the part in the file.
+        view: the number of the view in a stereo picture.
+        name: the name of the layer, without the view's name.
     """
 
     layer: str
     wavelengths: tuple[float, ...]
     channels: tuple[int, ...]
+    part: int = 0
+    view: int = 0
+    name: str = ""
+
+    @property
+    def component(self) -> str:
+        """The last part of its name, such as S0."""
+        return self.name.rpartition(".")[2]
+
+    def is_in(self, layer: str) -> bool:
+        """Return whether it is in a layer, or in a part or view of this name, in any case."""
+        names = self.layer.lower(), self.name.lower()
+        return layer.lower() in names or names[0].startswith(f"{layer.lower()}.")
 
     def __str__(self) -> str:
         layer = f" (layer {self.layer})" if self.layer else ""
@@ -68,28 +84,18 @@ def spectra_in(names: Sequence[str]) -> list[Spectrum]:
             metres = LIGHT_SPEED / value if match["unit"] == "Hz" and value else value
             bands.setdefault(match["layer"] or "", []).append((round(metres * 1e9, 6), channel))
     ordered = {layer: sorted(found) for layer, found in bands.items() if len(found) >= LEAST}
-    return [
-        Spectrum(layer, *map(tuple, zip(*found, strict=True)))
-        for layer, found in sorted(ordered.items())
-    ]
+    found = []
+    for layer, listed in sorted(ordered.items()):
+        wavelengths, channels = zip(*listed, strict=True)
+        found.append(Spectrum(layer, wavelengths, channels, name=layer))
+    return found
 
 
-def spectral_warnings(spec: Any, spectral: bool) -> list[str]:
-    """Return warnings about the spectral part of a file.
-
-    Args:
-        spec: the ``oiio.ImageSpec``.
-        spectral: whether the bands are read, not R, G and B.
-    """
-    if not spectral:
-        return [
-            f"its {each} are not used; its R, G and B were read. To read the bands, add --layer "
-            f"{SPECTRAL}"
-            for each in spectra_in(spec.channelnames)
-        ]
+def spectral_warnings(spec: Any) -> list[str]:
+    """Return warnings about what a file with bands states in its ``oiio.ImageSpec``."""
     stated = {name: spec.getattribute(name) for name in OF_SPECTRA}
     warnings = [
-        f"its {name}, {printable(str(value))[:60]}, is not applied; the camera's profile is used"
+        f"its {name}, {printable(str(value))[:60]}, is not applied"
         for name, value in stated.items()
         if value is not None
     ]
@@ -106,26 +112,25 @@ def light_in(path: Path, spectra: Sequence[Spectrum], layer: str | None = None) 
 
     Args:
         path: the file, for messages.
-        spectra: its spectra, at least one.
-        layer: the name of a layer; None or :data:`SPECTRAL` chooses.
+        spectra: its spectra in this layer, at least one.
+        layer: the name of the layer; None or :data:`SPECTRAL` chooses.
 
     Raises:
         ImageError: no spectrum is light, several may be it, or two bands are the same.
     """
-    named = {each.layer: each for each in spectra}
-    chosen = layer is not None and layer.lower() != SPECTRAL
-    emitted = [each for name, each in named.items() if name not in (*STOKES, REFLECTIVE)]
-    if chosen:
-        emitted = [each for each in spectra if each.layer.lower() == str(layer).lower()]
-    if not emitted or (chosen and emitted[0].layer == REFLECTIVE):
+    emitted = [each for each in spectra if each.component not in (*STOKES, REFLECTIVE)]
+    if not emitted:
         raise ImageError(
             f"{path}: its {spectra[0]} are reflectances or parts of polarised light, not the light "
             "that reaches a camera. Render the scene under a light, and write the layer S0"
         )
-    if not chosen and (polarised := [name for name in STOKES if name in named]):
+    first = min(each.view for each in emitted)
+    emitted = [each for each in emitted if each.view == first]
+    others = [each.component for each in spectra if each.view == first]
+    if polarised := [name for name in STOKES if name in others]:
         raise ImageError(
             f"{path}: this light is polarised (layers {', '.join(polarised)}), but clpipe's "
-            "filters are not. To use only its intensity, add --layer S0"
+            f"filters are not. To use only its intensity, add --layer {emitted[0].layer}"
         )
     if len(emitted) > 1:
         raise ImageError(

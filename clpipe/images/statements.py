@@ -82,7 +82,7 @@ def read_statements(path: Path, file: Any, xyz: bool = False, spectral: bool = F
         ImageError: the file cannot be read.
     """
     spec, format_ = file.spec(), file.format_name()
-    warnings = spectral_warnings(spec, spectral)
+    warnings = spectral_warnings(spec) if spectral else []
     aspect = spec.getattribute("PixelAspectRatio")
     header = radiance_header(path) if format_ == "hdr" else None
     if header:

@@ -314,7 +314,7 @@ class ImageLoader:
 
         around = source.panorama
         chain = loaded.chain
-        if source.wavelengths != chain.settings.render.wavelengths:
+        if source.wavelengths != chain.settings.render.wavelengths:  # a call costs more
             chain = with_bands(chain, source.wavelengths)
         entry_ = prepare_image(chain, source.pixels, source.margins, layer, source.shot, around)
         if entry_.pixels is source.pixels and not (

@@ -176,6 +176,11 @@ def read_panorama(job: Job, read: Callable[[Path], SourceImage], wide: WideAngle
             sources.append(read(path))
     first = sources[0]
     for path, other in zip(job.paths, sources, strict=True):
+        if other.wavelengths != first.wavelengths:
+            raise ImageError(
+                f"{path}: the spectral bands of this view are not those of {job.path}, from the "
+                "same point; render all views with the same bands"
+            )
         if other.pixels.ndim != 3 or other.pixels.shape != first.pixels.shape:
             size = "is a mosaic" if other.pixels.ndim != 3 else f"has {_size(other.pixels)} pixels"
             raise ImageError(

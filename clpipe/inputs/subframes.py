@@ -121,12 +121,16 @@ def average(
         if not found:
             weights = _weights_of_spans(job, source, shutter, spans)
             totals = np.zeros((len(spans), *pixels.shape), np.float32)
+        elif source.wavelengths != found[0].wavelengths:
+            raise _other_bands(path, job)
         elif (pixels.shape, source.margins) != (totals.shape[1:], found[0].margins):
             raise ImageError(
                 f"{path}: the size of this frame is {_size(source, pixels)}, but {job.path}, in "
                 f"the same exposure, has {_size(found[0], totals[0])}; render all frames at one "
                 "size"
             )
+        if light and light.wavelengths != source.wavelengths:
+            raise _other_bands(path, job)
         for total, (unlit, extra) in zip(totals, weights, strict=True):
             _add(total, unlit[number], pixels)
             if light:
@@ -136,6 +140,13 @@ def average(
         del source, light, pixels  # before the next frame is read
     averaged = replace(found[0], pixels=totals[0], later=tuple(totals[1:]))
     return with_file_records(averaged, job, found)
+
+
+def _other_bands(path: Path, job: Job) -> ImageError:
+    return ImageError(
+        f"{path}: its spectral bands are not those of {job.path}, in the same exposure; render all "
+        "frames with the same bands"
+    )
 
 
 def _weights_of_spans(

@@ -76,7 +76,9 @@ def negative_of(chain: Chain) -> Negative:
 def _is_seen(context: Context, array: FilterArray) -> bool:
     """Return whether the colours of a raw follow from the sensitivities of red, green and blue."""
     sight = context.sight
-    return sight is not None and sight.has_colours and set(array.channels) == set("RGB")
+    if sight is None or not sight.has_colours or set(array.channels) != set("RGB"):
+        return False
+    return np.allclose(np.linalg.inv(context.colours), sight.to_srgb)
 
 
 def dng_of(chain: Chain) -> Negative:

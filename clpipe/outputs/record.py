@@ -10,7 +10,7 @@ from clpipe.base.about import __version__
 from clpipe.base.files import Stored
 from clpipe.chain.chain import Chain
 from clpipe.chain.photometry import photometry_of
-from clpipe.chain.render_camera import POSE
+from clpipe.chain.render_camera import POSE, SPECTRA
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.engine.state import has_state
@@ -127,7 +127,8 @@ def picture_record(
         **({PLACE: asdict(job.place)} if job.place and has_state(chain) else {}),
         **({"lens": lens.name} if (lens := chain.optics.calibration) else {}),
         "output": chain.settings.output.model_dump()
-        | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE),
+        | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE | SPECTRA)
+        | chain.settings.render.model_dump(include=SPECTRA, exclude_defaults=True),
         "intrinsics": intrinsics.record() if intrinsics else None,
         "pose": chain.settings.render.pose,
         **motion_records(chain, source),

@@ -92,8 +92,10 @@ class CameraResponse(SpectralMethod):
 
     def weights(self, context: Context) -> Floats:
         assert context.sight
-        array, gains = context.array_ahead, context.illuminant_gains
-        channels = array.channels if self._sites else planes_of(array)
+        array, planes = context.array_ahead, planes_of(context.array_ahead)
+        # Set gains are those of red, green and blue. Other channels keep the sensor's levels.
+        gains = context.illuminant_gains if planes == "RGB" else context.sight.gains
+        channels = array.channels if self._sites else planes
         return _weights(context.sight, self._wavelengths, tuple(channels), gains)
 
     def passes(self) -> tuple[Pass, ...]:
