@@ -130,7 +130,7 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
     if not pictures and rejections:
         raise ImageError(f"{path}: {rejections[0]}")
     if chosen := spectra_to_read(layer, spectra, pictures):
-        best = _location_of(light_in(path, chosen, layer))
+        best = PictureLocation(**vars(light_in(path, chosen, layer)))
     elif not pictures:
         raise _no_picture(path, channel_names, mosaic)
     else:
@@ -152,17 +152,6 @@ def spectra_to_read(
         return [*spectra]
     is_picture = any(each.layer.lower() == layer.lower() for each in pictures)
     return [] if is_picture else [each for each in spectra if each.is_in(layer)]
-
-
-def _location_of(spectrum: Spectrum) -> PictureLocation:
-    return PictureLocation(
-        spectrum.part,
-        spectrum.layer,
-        spectrum.channels,
-        view=spectrum.view,
-        name=spectrum.name,
-        wavelengths=spectrum.wavelengths,
-    )
 
 
 def _no_picture(path: Path, channel_names: Sequence[str], mosaic: bool) -> NoPictureError:

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from clpipe.base.types import Doubles, Floats
+from clpipe.base.types import Floats
 from clpipe.camera.profile import SRGB_TO_XYZ
 from clpipe.camera.spectra import Sight, band_weights, observer
 from clpipe.reference.filter_array import FilterArray, kernel_table, tiled
@@ -90,13 +90,17 @@ class CameraResponse(SpectralMethod):
             return after
         return after.replace(colours=as_tuples(np.linalg.inv(context.sight.to_srgb).tolist()))
 
-    def weights(self, context: Context) -> Floats:
+    def _seen(self, context: Context) -> tuple[Any, ...]:
+        """Return the arguments of :func:`_weights`."""
         assert context.sight
         array, planes = context.array_ahead, planes_of(context.array_ahead)
         # Set gains are those of red, green and blue. Other channels keep the sensor's levels.
         gains = context.illuminant_gains if planes == "RGB" else context.sight.gains
         channels = array.channels if self._sites else planes
-        return _weights(context.sight, self._wavelengths, tuple(channels), gains)
+        return context.sight, self._wavelengths, tuple(channels), gains
+
+    def weights(self, context: Context) -> Floats:
+        return _weights(*self._seen(context))
 
     def passes(self) -> tuple[Pass, ...]:
         if not self._sites:
@@ -108,7 +112,7 @@ class CameraResponse(SpectralMethod):
         found = super().arguments(context)
         if not self._sites:
             return found
-        table = _site_table(self._sites, found["weights"].tobytes())  # type: ignore[union-attr]
+        table = _site_table(self._sites, *self._seen(context))
         return {**found, "weights": table, **period_of(self._sites.period)}
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
@@ -152,17 +156,17 @@ def _weights(
 
 
 @lru_cache(maxsize=64)
-def _site_table(array: FilterArray, weights: bytes) -> Floats:
-    """Return weights, (band, channel), of the filter at each position, in the layout of kernels."""
-    table = np.frombuffer(weights, np.float32).reshape(-1, len(array.channels))
-    rows = [array.by_position(dict(zip(array.channels, row, strict=True))) for row in table]
+def _site_table(array: FilterArray, *seen: Any) -> Floats:
+    """Return the :func:`_weights` of the filter at each position, in the layout of kernels."""
+    channels = array.channels
+    rows = [array.by_position(dict(zip(channels, row, strict=True))) for row in _weights(*seen)]
     return kernel_table(np.stack(rows, axis=1))
 
 
 @lru_cache(maxsize=16)
-def _observer_weights(wavelengths: Sequence[float], matrix: bytes) -> Floats:
-    weights = band_weights(observer(), wavelengths)
-    return (weights @ np.frombuffer(matrix).reshape(3, 3).T).astype(np.float32)
+def _observer_weights(wavelengths: Sequence[float], in_srgb: bool) -> Floats:
+    matrix = np.linalg.inv(SRGB_TO_XYZ) if in_srgb else np.eye(3)
+    return (band_weights(observer(), wavelengths) @ matrix.T).astype(np.float32)
 
 
 class ToXyz(SpectralMethod):
@@ -170,10 +174,9 @@ class ToXyz(SpectralMethod):
 
     method: ClassVar = "xyz"
     summary: ClassVar = "CIE XYZ, without a sensor"
-    _matrix: ClassVar[Doubles] = np.eye(3)
 
     def weights(self, context: Context) -> Floats:
-        return _observer_weights(self._wavelengths, self._matrix.tobytes())
+        return _observer_weights(self._wavelengths, self.method == ToSrgb.method)
 
 
 class ToSrgb(ToXyz):
@@ -181,7 +184,6 @@ class ToSrgb(ToXyz):
 
     method: ClassVar = "srgb"
     summary: ClassVar = "linear sRGB, so that the chain goes on like for a render in RGB"
-    _matrix: ClassVar[Doubles] = np.linalg.inv(SRGB_TO_XYZ)
 
 
 STAGE = rgb_stage(
