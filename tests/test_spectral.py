@@ -128,7 +128,7 @@ def test_what_is_read(names, layer, found, write):
         (BANDS[:4] + [n.replace("S0", "S1") for n in BANDS[:4]], None, r"polarised \(layers S1\)"),
         ([*BANDS[:4], *(n.replace("S0", "fog") for n in BANDS[:4])], None, "2 layers hold"),
         ([*BANDS[:4], "S0.400,0nm"], None, "two of its channels are the band of 400 nm"),
-        (BANDS, "RGB", "no R, G and B"),
+        (BANDS, "RGB", r"no layer 'RGB', but 31 spectral bands from 400 to 700 nm \(layer S0\)"),
     ],
 )
 def test_rejected_bands(names, layer, message, write):

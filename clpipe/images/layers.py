@@ -131,6 +131,12 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         raise ImageError(f"{path}: {rejections[0]}")
     if chosen := spectra_to_read(layer, spectra, pictures):
         best = PictureLocation(**vars(light_in(path, chosen, layer)))
+    elif spectra and not pictures:
+        listed = " and ".join(map(str, spectra))
+        raise ImageError(
+            f"{path}: there is no layer {layer!r}, but {listed}; name one of them with --layer, or "
+            "remove --layer"
+        )
     elif not pictures:
         raise _no_picture(path, channel_names, mosaic)
     else:
