@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from clpipe.batch.session import Run
     from clpipe.camera.noise import NoiseModel
     from clpipe.camera.profile import Camera, built_in_cameras, load_camera
+    from clpipe.chain.camera_info import CameraInfo
     from clpipe.dataset import Dataset, Patches, RawNoise
     from clpipe.dataset.streaming import StreamingDataset
     from clpipe.engine.runner import Result
@@ -28,6 +29,7 @@ _NAMES = {
     "clpipe.batch.session": ("Run",),
     "clpipe.camera.noise": ("NoiseModel",),
     "clpipe.camera.profile": ("Camera", "built_in_cameras", "load_camera"),
+    "clpipe.chain.camera_info": ("CameraInfo",),
     "clpipe.dataset": ("Dataset", "Patches", "RawNoise"),
     "clpipe.dataset.streaming": ("StreamingDataset",),
     "clpipe.engine.runner": ("Result",),
@@ -37,6 +39,7 @@ _NAMES = {
 
 __all__ = [
     "Camera",
+    "CameraInfo",
     "ClpipeError",
     "Dataset",
     "DeviceError",

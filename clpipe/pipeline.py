@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Unpack
 
@@ -236,7 +237,8 @@ class Pipeline(ReadOnly):
         """
         chain, options = prepared.chain, RunOptions(state=state)
         seed = noise_key(chain.settings, prepared.own_key)
-        return self._service.run(picture(chain, prepared.pixels, seed, self._kept, options))
+        result = self._service.run(picture(chain, prepared.pixels, seed, self._kept, options))
+        return replace(result, origin=(chain, prepared.pixels.shape[1::-1]))
 
     def prepare(
         self,

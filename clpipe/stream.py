@@ -6,7 +6,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Self, Unpack
 
@@ -16,6 +16,7 @@ from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError, Reque
 from clpipe.base.types import Array
 from clpipe.base.user_warnings import Issued, warn
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.camera_info import CameraInfo
 from clpipe.chain.options import Transfer
 from clpipe.engine.runner import Result
 from clpipe.engine.state import State
@@ -51,6 +52,7 @@ class Shot:
         metered: what was metered for this frame only, by name. A frame without light has nothing,
             and holds the control loops.
         result: the kept images, and the numbers that stages estimated.
+        time: the time that was passed with the frame, s; None if there was none.
     """
 
     index: int
@@ -58,6 +60,12 @@ class Shot:
     settings: Mapping[str, Any]
     metered: Mapping[str, float]
     result: Result
+    time: float | None = None
+
+    @property
+    def camera(self) -> CameraInfo:
+        """The camera of the frame, see :class:`CameraInfo`."""
+        return replace(self.result.camera, time=self.time)
 
 
 class _Frames(Pipeline):
@@ -188,7 +196,13 @@ class Stream:
             ) from None
         self._in_thread(self._rehearse, frame).result()
 
-    def __call__(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> Shot:
+    def __call__(
+        self,
+        frame: Array,
+        depth: Array | None = None,
+        flow: Array | None = None,
+        time: float | None = None,
+    ) -> Shot:
         """Develop the next frame, and return its picture.
 
         Args:
@@ -198,6 +212,7 @@ class Stream:
             flow: (height, width, 2), for temporal_denoise with the method flow: from each pixel to
                 the place of its surface in the frame before, in px to the right and down. Pixels
                 whose surface that frame does not show are NaN. All of the first frame may be NaN.
+            time: the simulator's time of the frame, s, which :class:`Shot` repeats.
 
         Raises:
             ImageError, RequestError: as for :meth:`Pipeline.process`. The next frame can still be
@@ -207,9 +222,15 @@ class Stream:
         if self._is_threaded:
             raise RequestError("this stream develops the frames of put; use get, not a call")
         index, light = next(self._numbers), as_array(frame, "frame")
-        return self._announced(*self._next_shot(index, light, _by_kind(depth, flow)))
+        return self._announced(*self._next_shot(index, light, _by_kind(depth, flow), time))
 
-    def put(self, frame: Array, depth: Array | None = None, flow: Array | None = None) -> bool:
+    def put(
+        self,
+        frame: Array,
+        depth: Array | None = None,
+        flow: Array | None = None,
+        time: float | None = None,
+    ) -> bool:
         """Pass the next frame to the stream's thread. The frame is copied.
 
         At most two frames are in the stream. If neither of their pictures has been fetched with
@@ -234,7 +255,7 @@ class Stream:
             self.dropped += 1
             return False
         copied = {kind: layer.copy() for kind, layer in layers.items()}
-        self._in_thread(self._deliver, index, image.copy(), copied)
+        self._in_thread(self._deliver, index, image.copy(), copied, time)
         return True
 
     def get(self, timeout: float | None = None) -> Shot | None:
@@ -363,11 +384,12 @@ class Stream:
             self._develop(index, frame, layers, meter, state)
 
     def _next_shot(
-        self, index: int, frame: Array, arrays: Mapping[str, Array]
+        self, index: int, frame: Array, arrays: Mapping[str, Array], time: float | None
     ) -> tuple[Shot, tuple[str, ...]]:
-        """Develop the next frame. Arguments and result are those of :meth:`_develop`."""
+        """Develop the next frame, with its time. The rest is that of :meth:`_develop`."""
         try:
-            return self._develop(index, frame, arrays, self._meter, self._state)
+            shot, warnings = self._develop(index, frame, arrays, self._meter, self._state)
+            return replace(shot, time=time), warnings
         except (DeviceError, DeviceFailedError):
             self._state = State()  # the next frame starts again
             raise

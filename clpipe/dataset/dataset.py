@@ -64,6 +64,8 @@ class Dataset(ReadOnly):
     - With a raw in the chain, "cfa", such as "RGGB", and "black_level" and "white_level" in DN.
       "gains" is the white balance of red, green and blue. "xyz_to_camera", 3x3, maps CIE XYZ (D65)
       to the colours of the raw, like ColorMatrix of a DNG.
+    - "k", "d" and "distortion_model", "exposure_time", "row_time" and "color_matrix", like those of
+      :class:`clpipe.CameraInfo`. They are of the whole picture. Unknown numbers are NaN.
     - With ``patch``, "place": its first column and row in the picture, and "turn": its EXIF
       orientation after augmentation (1 is unchanged).
 

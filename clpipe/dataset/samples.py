@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 from clpipe.base.digests import stamp_of
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.user_warnings import Issued, warn
+from clpipe.chain.camera_info import camera_info
 from clpipe.chain.carry import VALID
 from clpipe.chain.identity import frame_key, noise_key
 from clpipe.chain.python_words import python_words
@@ -22,6 +23,7 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader, LoadedImage
 from clpipe.inputs.raw import RawImage
 from clpipe.outputs.patches import Patch, Patches
+from clpipe.outputs.record import intrinsics_of
 
 Read = tuple[LoadedImage, Sample]  # an image, and its layers
 
@@ -203,7 +205,10 @@ class SampleLoader:
         adds_noise = chain.is_noisy or not isinstance(loaded.source, RawImage)
         noise = chain.noise if adds_noise else None
         a, b = (noise.a, noise.b) if noise else (0.0, 0.0)
-        return {"key": batch.job.key, "epoch": batch.epoch, "iso": chain.iso, "a": a, "b": b}
+        height, width = loaded.source.pixels.shape[:2]
+        camera = camera_info(chain, {}, (width, height), intrinsics_of(chain, loaded.source))
+        facts = {"key": batch.job.key, "epoch": batch.epoch, "iso": chain.iso, "a": a, "b": b}
+        return facts | camera.arrays()
 
     def _service(self) -> Service:
         """Return the service of this process.

@@ -1,7 +1,7 @@
 """Runs a chain on images, on a device or in NumPy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -9,8 +9,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from clpipe.base.cache import BoundedCache
-from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError
+from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError, RequestError
 from clpipe.base.types import Array, Floats
+from clpipe.chain.camera_info import CameraInfo, camera_info
 from clpipe.chain.chain import Chain
 from clpipe.chain.exposures import exposures_of
 from clpipe.chain.registry import user_code_errors
@@ -57,12 +58,32 @@ class Result:
         kept: the images after the steps to keep, float32, by step.
         estimates: the numbers that stages estimated from the image, such as gains, by step and
             name.
+        origin: the chain, and the width and height of the image in px; None if they are unknown.
     """
 
     final: Floats | None
     encoded: Array | None
     kept: dict[str, Floats]
     estimates: dict[str, dict[str, float]]
+    origin: tuple[Chain, tuple[int, int]] | None = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def camera(self) -> CameraInfo:
+        """The camera of the image, see :class:`CameraInfo`.
+
+        Raises:
+            RequestError: the camera's values contradict each other, or the result is from another
+                process.
+        """
+        if self.origin is None:
+            raise RequestError("this result does not know its chain, so its camera is unknown")
+        chain, size = self.origin
+        is_whole = chain.steps[0].name == chain.names[0]  # else a lens may have been before
+        known = chain.intrinsics(*size, {}) if is_whole else None
+        return camera_info(chain, self.estimates, size, known)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "origin": None}  # chains cannot leave their process
 
     @property
     def image(self) -> Array:

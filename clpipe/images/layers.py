@@ -131,14 +131,8 @@ def find_picture(path: Path, file: Any, mosaic: bool, layer: str | None) -> Pict
         raise ImageError(f"{path}: {rejections[0]}")
     if chosen := spectra_to_read(layer, spectra, pictures):
         best = PictureLocation(**vars(light_in(path, chosen, layer)))
-    elif spectra and not pictures:
-        listed = " and ".join(map(str, spectra))
-        raise ImageError(
-            f"{path}: there is no layer {layer!r}, but {listed}; name one of them with --layer, or "
-            "remove --layer"
-        )
     elif not pictures:
-        raise _no_picture(path, channel_names, mosaic)
+        raise _no_picture(path, layer, spectra, channel_names, mosaic)
     else:
         named = layer is not None and _picture_in_layer(path, pictures, layer)
         best = replace(named or _preferred(path, pictures), unread=tuple(spectra))
@@ -160,8 +154,19 @@ def spectra_to_read(
     return [] if is_picture else [each for each in spectra if each.is_in(layer)]
 
 
-def _no_picture(path: Path, channel_names: Sequence[str], mosaic: bool) -> NoPictureError:
+def _no_picture(
+    path: Path,
+    layer: str | None,
+    spectra: Sequence[Spectrum],
+    channel_names: Sequence[str],
+    mosaic: bool,
+) -> ImageError:
     """Return the error for a file without a picture."""
+    if spectra:
+        return ImageError(
+            f"{path}: there is no layer {layer!r}, but {' and '.join(map(str, spectra))}; name one "
+            "of them with --layer, or remove --layer"
+        )
     listed = ", ".join(name for name in channel_names[:20] if name) or "none"
     missing = "several channels, but a mosaic has one" if mosaic else "no R, G and B channels"
     advice = "" if mosaic else "To use its layers as ground truth of a picture, see --carry"

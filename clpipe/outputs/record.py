@@ -8,6 +8,7 @@ from typing import Any
 
 from clpipe.base.about import __version__
 from clpipe.base.files import Stored
+from clpipe.chain.camera_info import camera_info
 from clpipe.chain.chain import Chain
 from clpipe.chain.photometry import photometry_of
 from clpipe.chain.render_camera import POSE, SPECTRA
@@ -130,6 +131,9 @@ def picture_record(
         | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE | SPECTRA)
         | chain.settings.render.model_dump(include=SPECTRA, exclude_defaults=True),
         "intrinsics": intrinsics.record() if intrinsics else None,
+        "camera_info": camera_info(
+            chain, result.estimates, source.pixels.shape[1::-1], intrinsics
+        ).record(),
         "pose": chain.settings.render.pose,
         **motion_records(chain, source),
         **row_times(chain, source),
