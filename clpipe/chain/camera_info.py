@@ -1,13 +1,13 @@
 """The camera of a picture as other programs name it: OpenCV's K and D, ROS's CameraInfo."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from clpipe.chain.chain import Chain
+from clpipe.chain.chain import Chain, cached_by_structure
 from clpipe.chain.photometry import Estimates, exposure_of
 from clpipe.reference.filter_array import FilterArray
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV_FISHEYE, THIN_PRISM, Intrinsics
@@ -15,6 +15,7 @@ from clpipe.stage import Kind, StageRole
 
 # ROS's distortion models (sensor_msgs/distortion_models.hpp), and the order of OpenCV's D.
 PLUMB_BOB, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "equidistant"
+NO_LENS = (0.0,) * 12
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 Row = tuple[float, ...]
 
@@ -78,14 +79,14 @@ class CameraInfo:
 
     def record(self) -> dict[str, Any]:
         """Return the camera as JSON values, with the projection matrix."""
-        return {**asdict(self), "p": self.p}
+        return {**vars(self), "p": self.p}
 
     def arrays(self) -> dict[str, Any]:
         """Return what a sample has of it. Numbers that are unknown are NaN, and D has 12."""
         unknown = np.full((3, 3), np.nan)
         return {
             "k": np.array(self.k) if self.k else unknown,
-            "d": np.array((*self.d, *[0.0] * (len(ORDER) - len(self.d)))),
+            "d": np.array(self.d + NO_LENS[len(self.d) :]),
             "distortion_model": self.distortion_model,
             "exposure_time": math.nan if self.exposure_time is None else self.exposure_time,
             "row_time": self.row_time,
@@ -122,6 +123,14 @@ def encoding_of(array: FilterArray) -> str:
     return "mono16" if array.is_gray else "16UC1"
 
 
+@cached_by_structure
+def _steps(chain: Chain) -> tuple[int | None, ...]:
+    """Return the places of the steps that balance, expose rows and convert colours."""
+    roles = [step.stage.role for step in chain.steps]
+    wanted = StageRole.BALANCE, StageRole.SHUTTER, StageRole.COLOURS
+    return tuple(roles.index(role) if role in roles else None for role in wanted)
+
+
 def camera_info(
     chain: Chain, estimates: Estimates, size: tuple[int, int], intrinsics: Intrinsics | None
 ) -> CameraInfo:
@@ -141,14 +150,15 @@ def camera_info(
         cx, cy = intrinsics.cx - 0.5, intrinsics.cy - 0.5
         k = (intrinsics.fx, 0.0, cx), (0.0, intrinsics.fy, cy), (0.0, 0.0, 1.0)
     raw, camera = chain.raw_context, chain.camera
+    noise = raw.noise or camera.noise(chain.iso)
     has_raw = chain.raw_step_name is not None or chain.source is Kind.RAW
     raw_encoding = encoding_of(chain.filter_array) if has_raw else ""
     encodings = {Kind.DISPLAY: "rgb8", Kind.RAW: raw_encoding, Kind.MOSAIC: "32FC1"}
-    exposure, balance = exposure_of(chain, estimates), chain.step_in(StageRole.BALANCE)
+    exposure, (balance, shutter, colours) = exposure_of(chain, estimates), _steps(chain)
     red, blue = chain.context_after.applied_gains
-    found = estimates.get(balance.name, {}) if balance else {}
-    shutter, colours = chain.step_in(StageRole.SHUTTER), chain.step_in(StageRole.COLOURS)
-    matrix = getattr(colours and colours.method, "matrix", None)
+    found = estimates.get(chain.steps[balance].name, {}) if balance is not None else {}
+    matrix = None if colours is None else getattr(chain.steps[colours].method, "matrix", None)
+    rows = None if shutter is None else chain.steps[shutter].method
     return CameraInfo(
         width,
         height,
@@ -161,8 +171,8 @@ def camera_info(
         camera.white_level if raw.white_level is None else raw.white_level,
         (exposure and exposure.time) or chain.optics.exposure_time,
         chain.iso,
-        camera.noise(chain.iso).a * camera.signal_range if has_raw else None,
+        noise.a * noise.signal_range if has_raw else None,
         (found.get("red_gain", red), 1.0, found.get("blue_gain", blue)),
         matrix,
-        getattr(shutter and shutter.method, "line_time", 0.0),
+        getattr(rows, "line_time", 0.0),
     )
