@@ -218,13 +218,8 @@ class Pipeline(ReadOnly):
         arrays = {} if depth is None else {"depth": depth}
         with errors_in_python():
             prepared = self.prepare(image, key, arrays, overscan, settings)
-            for text in prepared.warnings:
-                warn(f"{key}: {python_words(text)}")
-            result, chain = self.develop(prepared), prepared.chain
-        share = clipped_share(result, chain) or 0.0
-        # Photographs are already clipped.
-        if share >= WARNING_SHARE and chain.source is not Kind.DISPLAY:
-            warn(f"{key}: {clipping_text(share)}")
+            result = self.develop(prepared)
+        self._announce(key, prepared, result)
         return result
 
     def develop(self, prepared: Prepared, state: State | None = None) -> Result:
@@ -237,8 +232,8 @@ class Pipeline(ReadOnly):
         """
         chain, options = prepared.chain, RunOptions(state=state)
         seed = noise_key(chain.settings, prepared.own_key)
-        result = self._service.run(picture(chain, prepared.pixels, seed, self._kept, options))
-        return replace(result, origin=(chain, prepared.pixels.shape[1::-1]))
+        frame = picture(chain, prepared.pixels, seed, self._kept, options)
+        return self._with_origin(self._service.run(frame), prepared)
 
     def prepare(
         self,
@@ -355,9 +350,18 @@ class Pipeline(ReadOnly):
         return self._chain(own.drawn(key)) if settings or own.draws else self.chain
 
     def process_many(
-        self, images: Iterable[Array | tuple[Array, str | Mapping[str, Any]]]
+        self,
+        images: Array | Iterable[Array | tuple[Array, str | Mapping[str, Any]]],
+        names: Sequence[str] | None = None,
+        views: Sequence[Mapping[str, Any]] | None = None,
+        times: Sequence[float] | None = None,
+        **settings: "Unpack[Keywords]",
     ) -> Iterator[Result]:
-        """Run the chain on several images. An image is processed when you take its result.
+        """Run the chain on several images, or on a stack of views.
+
+        Images of an iterable are processed one by one, when you take their results. The views of a
+        stack are processed together, which costs less for small ones. Their results are the same
+        as one by one.
 
         >>> import numpy as np
         >>> import clpipe
@@ -366,21 +370,93 @@ class Pipeline(ReadOnly):
         >>> images = [(render, "a"), (render, {"key": "b", "iso": 3200})]
         >>> [shot.image.shape for shot in camera.process_many(images)]
         [(24, 32, 3), (24, 32, 3)]
+        >>> stack = np.stack([render, render / 2])
+        >>> views = [{"camera": "sony-a7r2"}, {"camera": "nikon-d850", "iso": 100}]
+        >>> shots = camera.process_many(stack, ["left", "right"], views, times=[0.5, 0.5])
+        >>> [(shot.image.shape, shot.camera.iso, shot.camera.time) for shot in shots]
+        [((24, 32, 3), 800.0, 0.5), ((24, 32, 3), 100.0, 0.5)]
 
         Args:
-            images: images, or pairs of an image and its key, or pairs of an image and a dict of
+            images: a stack of views, (view, height, width, 3), like an image of :meth:`process`.
+                Or images, or pairs of an image and its key, or pairs of an image and a dict of
                 arguments of :meth:`process`, such as ``{"key": "a", "iso": 800}``. The default key
                 is the number of the image ("0", "1", ...), which continues in further calls.
+            names: the keys of the views of a stack.
+            views: the settings of each view of a stack.
+            times: the times of the views of a stack, in s, for their ``camera``.
+            **settings: values for all images.
+
+        Raises:
+            ImageError, RequestError: as for :meth:`process`, or there are not as many names, views
+                or times as views in the stack.
         """
+        is_stack = any(hasattr(images, name) for name in ("__dlpack__", "__array_interface__"))
+        if is_stack:
+            with errors_in_python():
+                stack = as_array(images, "images")
+                yield from self._process_stack(stack, names, views, times, settings)
+            return
+        if names or views or times:
+            raise RequestError(
+                "names, views and times belong to the views of a stack, (view, height, width, 3); "
+                "for other images, pass pairs of an image and its arguments"
+            )
         for item in images:
             if isinstance(item, tuple) and len(item) != 2:
                 raise ImageError(f"found a tuple of {len(item)}; expected an image and its key")
             image, arguments = item if isinstance(item, tuple) else (item, {})
             keywords = {"key": arguments} if isinstance(arguments, str) else arguments
-            with self._lock:
-                key = str(self._count)
-                self._count += 1
-            yield self.process(image, **{"key": key, **keywords})
+            yield self.process(image, **{"key": self._next_key(), **settings, **keywords})
+
+    def _process_stack(
+        self,
+        stack: Array,
+        names: Sequence[str] | None,
+        views: Sequence[Mapping[str, Any]] | None,
+        times: Sequence[float] | None,
+        settings: Mapping[str, Any],
+    ) -> list[Result]:
+        """Return the results of the views of a stack, see :meth:`process_many`."""
+        count = len(stack)
+        for what, given in (("names", names), ("views", views), ("times", times)):
+            if given is not None and len(given) != count:
+                raise RequestError(f"found {len(given)} {what}, but the stack has {count} views")
+        keys = names or [self._next_key() for _ in range(count)]
+        own = [{**settings, **each} for each in views] if views else [settings] * count
+        triples = zip(stack, keys, own, strict=True)
+        prepared = [self.prepare(view, key, {}, NO_MARGINS, one) for view, key, one in triples]
+        frames = []
+        for each in prepared:
+            seed = noise_key(each.chain.settings, each.own_key)
+            frames.append(picture(each.chain, each.pixels, seed, self._kept, RunOptions()))
+        results = []
+        for number, development in enumerate(self._service.develop(frames)):
+            result = self._with_origin(development.result(), prepared[number])
+            if times:
+                result = replace(result, time=float(times[number]))
+            self._announce(keys[number], prepared[number], result)
+            results.append(result)
+        return results
+
+    def _next_key(self) -> str:
+        """Return the number of the next image without a name."""
+        with self._lock:
+            self._count += 1
+            return str(self._count - 1)
+
+    @staticmethod
+    def _with_origin(result: Result, prepared: Prepared) -> Result:
+        return replace(result, origin=(prepared.chain, prepared.pixels.shape[1::-1]))
+
+    @staticmethod
+    def _announce(key: str, prepared: Prepared, result: Result) -> None:
+        """Issue the warnings about an image."""
+        for text in prepared.warnings:
+            warn(f"{key}: {python_words(text)}")
+        share = clipped_share(result, prepared.chain) or 0.0
+        # Photographs are already clipped.
+        if share >= WARNING_SHARE and prepared.chain.source is not Kind.DISPLAY:
+            warn(f"{key}: {clipping_text(share)}")
 
 
 def digest_of(image: Array) -> str:

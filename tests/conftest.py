@@ -79,7 +79,9 @@ def statuses(folder: str | Path) -> dict[str, str]:
 def same_samples(one: Mapping[str, Any], two: Mapping[str, Any]) -> None:
     """Check that two samples of a dataset are equal."""
     assert one.keys() == two.keys()
-    assert all(np.array_equal(one[name], two[name]) for name in one)
+    for name, value in one.items():
+        is_float = np.asarray(value).dtype.kind == "f"  # which may be NaN
+        assert np.array_equal(value, two[name], equal_nan=is_float), name
 
 
 def run_cli(*arguments: object, status: int | tuple[int, ...] = 0) -> ClickResult:

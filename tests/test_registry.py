@@ -255,6 +255,7 @@ def test_a_package_whose_stage_cannot_be_loaded(tmp_path):
 # These names are not stages: a truth, an attribute of kept images, a kind, a key of cameras.json.
 NO_STAGES = {
     ("chain/rendition.py", "mosaic"),
+    ("chain/camera_info.py", "color_matrix"),
     ("inputs/kept.py", "sensor_noise"),
     ("explorer/view.py", "mosaic"),
     ("inputs/render_cameras.py", "distortion"),

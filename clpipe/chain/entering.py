@@ -128,6 +128,7 @@ def with_bands(chain: Chain, wavelengths: tuple[float, ...]) -> Chain:
     return make_chain(settings, chain.source, until=chain.steps[-1].name)
 
 
+@lru_cache(maxsize=64)
 @cached_by_structure
 def lacks_radiance(chain: Chain) -> bool:
     """Return whether a chain lacks the spectra from which its exposure is computed."""

@@ -59,6 +59,7 @@ class Result:
         estimates: the numbers that stages estimated from the image, such as gains, by step and
             name.
         origin: the chain, and the width and height of the image in px; None if they are unknown.
+        time: the time of the image, s; None if none was stated.
     """
 
     final: Floats | None
@@ -66,6 +67,7 @@ class Result:
     kept: dict[str, Floats]
     estimates: dict[str, dict[str, float]]
     origin: tuple[Chain, tuple[int, int]] | None = field(default=None, repr=False, compare=False)
+    time: float | None = None
 
     @cached_property
     def camera(self) -> CameraInfo:
@@ -80,7 +82,7 @@ class Result:
         chain, size = self.origin
         is_whole = chain.steps[0].name == chain.names[0]  # else a lens may have been before
         known = chain.intrinsics(*size, {}) if is_whole else None
-        return camera_info(chain, self.estimates, size, known)
+        return replace(camera_info(chain, self.estimates, size, known), time=self.time)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "origin": None}  # chains cannot leave their process

@@ -10,11 +10,14 @@ from clpipe.base.memory import release_pages
 from clpipe.base.types import Array
 from clpipe.stage import Kind
 
+CPU = 1  # DLPack's number of this device
 BLOCK = 1 << 24  # samples that are checked at a time
 
 
 def as_array(value: Any, what: str) -> Array:
     """Return a NumPy array that shares the memory of an array or DLPack tensor of any library.
+
+    An array on a GPU is copied once, if its library can do that.
 
     Args:
         value: the array or tensor.
@@ -26,6 +29,8 @@ def as_array(value: Any, what: str) -> Array:
     if isinstance(value, np.ndarray):
         return value
     kind = type(value).__name__
+    if hasattr(value, "__array_interface__"):
+        return np.asarray(value)
     if not hasattr(value, "__dlpack__"):
         way = f"numpy.asarray({what})" if isinstance(value, list | tuple) else "a NumPy array"
         if isinstance(value, str | PurePath):
@@ -34,7 +39,9 @@ def as_array(value: Any, what: str) -> Array:
     if getattr(value, "requires_grad", False):
         raise ImageError(f"{what} is a {kind} with a gradient. Pass {what}.detach()")
     try:
-        return np.from_dlpack(value)
+        is_here = value.__dlpack_device__()[0] == CPU
+        # NumPy asks the library for a copy, if the memory is that of a GPU.
+        return np.from_dlpack(value) if is_here else np.from_dlpack(value, device="cpu")
     except (BufferError, RuntimeError, TypeError, ValueError) as error:
         raise ImageError(
             f"{what} is a {kind} whose memory cannot be shared ({error}). If it is on a GPU, pass "
