@@ -32,7 +32,7 @@ from clpipe.engine.clipping import WARNING_SHARE, clipped_share, clipping_text
 from clpipe.engine.device import Device, open_device
 from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result
-from clpipe.engine.service import Service, picture
+from clpipe.engine.service import Frame, Service, picture
 from clpipe.engine.state import State
 from clpipe.images.arrays import as_array, as_image
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
@@ -230,10 +230,13 @@ class Pipeline(ReadOnly):
         Raises:
             ImageError: the image is too large.
         """
-        chain, options = prepared.chain, RunOptions(state=state)
-        seed = noise_key(chain.settings, prepared.own_key)
-        frame = picture(chain, prepared.pixels, seed, self._kept, options)
+        frame = self._frame(prepared, RunOptions(state=state))
         return self._with_origin(self._service.run(frame), prepared)
+
+    def _frame(self, prepared: Prepared, options: RunOptions) -> Frame:
+        """Return a prepared image for the service."""
+        seed = noise_key(prepared.chain.settings, prepared.own_key)
+        return picture(prepared.chain, prepared.pixels, seed, self._kept, options)
 
     def prepare(
         self,
@@ -425,10 +428,7 @@ class Pipeline(ReadOnly):
         own = [{**settings, **each} for each in views] if views else [settings] * count
         triples = zip(stack, keys, own, strict=True)
         prepared = [self.prepare(view, key, {}, NO_MARGINS, one) for view, key, one in triples]
-        frames = []
-        for each in prepared:
-            seed = noise_key(each.chain.settings, each.own_key)
-            frames.append(picture(each.chain, each.pixels, seed, self._kept, RunOptions()))
+        frames = [self._frame(each, RunOptions()) for each in prepared]
         results = []
         for number, development in enumerate(self._service.develop(frames)):
             result = self._with_origin(development.result(), prepared[number])

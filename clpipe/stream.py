@@ -6,29 +6,38 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Self, Unpack
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, Unpack
 
 import numpy as np
 
 from clpipe.base.errors import DeviceError, DeviceFailedError, ImageError, RequestError
+from clpipe.base.text import unknown_name
 from clpipe.base.types import Array
 from clpipe.base.user_warnings import Issued, warn
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.camera_info import CameraInfo
 from clpipe.chain.options import Transfer
+from clpipe.chain.registry import stage_in
+from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result
-from clpipe.engine.state import State
+from clpipe.engine.service import Development
+from clpipe.engine.state import State, has_state
 from clpipe.images.arrays import as_array, as_image
 from clpipe.inputs.metering import Meter, merged
+from clpipe.inputs.subframes import add_frame, weights_of
 from clpipe.pipeline import Pipeline, Prepared
 from clpipe.reference.geometry import NO_MARGINS
 from clpipe.reference.transfer import inverse_srgb_curve
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
+from clpipe.stages.shutter import Rows
 
 if TYPE_CHECKING:
     from clpipe.chain.keywords import Keywords
+
+T = TypeVar("T")
 
 SRGB = inverse_srgb_curve(np.arange(256) / 255).astype(np.float32)  # the light of 8-bit codes
 
@@ -53,6 +62,7 @@ class Shot:
             and holds the control loops.
         result: the kept images, and the numbers that stages estimated.
         time: the time that was passed with the frame, s; None if there was none.
+        view: the name of its view; "" in a stream without views.
     """
 
     index: int
@@ -61,6 +71,7 @@ class Shot:
     metered: Mapping[str, float]
     result: Result
     time: float | None = None
+    view: str = ""
 
     @property
     def camera(self) -> CameraInfo:
@@ -68,10 +79,80 @@ class Shot:
         return replace(self.result.camera, time=self.time)
 
 
+@dataclass
+class _View:
+    """A camera of a stream, whose frames are a sequence."""
+
+    name: str
+    key: str  # of the sequence
+    settings: Mapping[str, Any]
+    meter: Meter
+    state: State = field(default_factory=State)
+    numbers: Iterator[int] = field(default_factory=itertools.count)
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A frame that a stream has taken."""
+
+    view: _View
+    index: int
+    pixels: Sequence[Array]  # its sub-frames
+    arrays: Mapping[str, Array]
+    time: float | None
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A frame that was metered: its chain, what was metered, and its settings."""
+
+    taken: _Taken
+    prepared: Prepared
+    metered: Mapping[str, float]
+    settings: Mapping[str, Any]
+
+
 class _Frames(Pipeline):
     """A pipeline for the frames of a sequence."""
 
     _is_sequence = True
+
+    def exposed(self, frames: Sequence[Array], key: str, settings: Mapping[str, Any]) -> Array:
+        """Return the image of an exposure: for each row, the mean of its sub-frames.
+
+        Raises:
+            ImageError, RequestError: there are not as many as the shutter states, or they differ.
+        """
+        if len(frames) == 1:
+            return frames[0]
+        chain = self._chain_for(key, settings)
+        step = chain.step_in(StageRole.SHUTTER)
+        shutter = step.method if step and isinstance(step.method, Rows) else Rows()
+        if shutter.subframes != len(frames):
+            raise RequestError(
+                f"found {len(frames)} sub-frames, but {stage_in(StageRole.SHUTTER).name}.subframes "
+                f"is {shutter.subframes}; set it to their number"
+            )
+        if len({frame.shape for frame in frames}) > 1:
+            raise ImageError("the sub-frames of an exposure have different shapes; use one shape")
+        weights = weights_of(shutter, len(frames), frames[0].shape[0], NO_MARGINS)
+        total = np.zeros(frames[0].shape, np.float32)
+        for each, frame in zip(weights, frames, strict=True):
+            add_frame(total, each, frame)
+        return total
+
+    def develop_many(self, prepared: Sequence[Prepared]) -> list[Callable[[], Result]]:
+        """Begin to develop images without state, and return functions that wait for the results.
+
+        Small images share launches. A function raises ImageError if its image is too large.
+        """
+        frames = [self._frame(each, RunOptions()) for each in prepared]
+
+        def wait(development: Development, origin: Prepared) -> Result:
+            return self._with_origin(development.result(), origin)
+
+        pairs = zip(self._service.develop(frames), prepared, strict=True)
+        return [partial(wait, *pair) for pair in pairs]
 
     def meter(self) -> Meter:
         """Return the meter of a sequence."""
@@ -109,6 +190,7 @@ class Stream:
         transfer: "srgb" if frames are finished pictures of sRGB in eight bits, as most simulators
             render them. They are converted to light.
         drop: whether :meth:`put` drops a frame instead of waiting, see there.
+        views: the settings of each camera of a rig, by its name. Each has a sequence of its own.
         **settings: as for :class:`Pipeline`.
 
     Attributes:
@@ -130,20 +212,22 @@ class Stream:
         keep: str | Sequence[str] | None = None,
         transfer: Transfer = "linear",
         drop: bool = False,
+        views: Mapping[str, Mapping[str, Any]] | None = None,
         **settings: "Unpack[Keywords]",
     ) -> None:
         self.dropped = 0
         self._pipeline = _Frames(config, device=device, until=until, keep=keep, **settings)
-        self._name = name
         self._is_srgb = transfer == "srgb"
         self._drop = drop
-        self._meter, self._state = self._pipeline.meter(), State()
+        self._views = {
+            view: _View(view, f"{name}/{view}" if view else name, own, self._pipeline.meter())
+            for view, own in (views or {"": {}}).items()
+        }
         self._issued = Issued()
-        self._numbers = itertools.count()
         # One frame waits while another is developed.
         self._free = threading.Semaphore(2)
-        self._shots: queue.SimpleQueue[tuple[Shot, tuple[str, ...]] | Exception | None]
-        self._shots = queue.SimpleQueue()
+        # Each is a shot with its warnings, or an error, and whether it is the last of a put.
+        self._shots: queue.SimpleQueue[tuple[_Found, bool] | None] = queue.SimpleQueue()
         self._thread = ThreadPoolExecutor(1, "stream")
         self._lock = threading.Lock()  # lets no frame follow the end
         self._process = os.getpid()
@@ -198,21 +282,24 @@ class Stream:
 
     def __call__(
         self,
-        frame: Array,
+        frame: Array | Sequence[Array],
         depth: Array | None = None,
         flow: Array | None = None,
         time: float | None = None,
+        view: str | None = None,
     ) -> Shot:
         """Develop the next frame, and return its picture.
 
         Args:
             frame: (height, width, 3) linear light as for :meth:`Pipeline.process`, or with
-                ``transfer="srgb"`` uint8. An array in shared memory is not copied.
+                ``transfer="srgb"`` uint8. An array in shared memory is not copied. A list has the
+                sub-frames of an exposure, as many as ``shutter.subframes``.
             depth: as for :meth:`Pipeline.process`.
             flow: (height, width, 2), for temporal_denoise with the method flow: from each pixel to
                 the place of its surface in the frame before, in px to the right and down. Pixels
                 whose surface that frame does not show are NaN. All of the first frame may be NaN.
             time: the simulator's time of the frame, s, which :class:`Shot` repeats.
+            view: the name of its camera, in a stream with views.
 
         Raises:
             ImageError, RequestError: as for :meth:`Pipeline.process`. The next frame can still be
@@ -221,15 +308,15 @@ class Stream:
         self._check_accepts()
         if self._is_threaded:
             raise RequestError("this stream develops the frames of put; use get, not a call")
-        index, light = next(self._numbers), as_array(frame, "frame")
-        return self._announced(*self._next_shot(index, light, _by_kind(depth, flow), time))
+        return self._announced(*self._next_shot(self._taken(frame, depth, flow, time, view)))
 
     def put(
         self,
-        frame: Array,
+        frame: Array | Sequence[Array],
         depth: Array | None = None,
         flow: Array | None = None,
         time: float | None = None,
+        view: str | None = None,
     ) -> bool:
         """Pass the next frame to the stream's thread. The frame is copied.
 
@@ -241,22 +328,94 @@ class Stream:
 
         Raises:
             ImageError: this is no array.
-            RequestError: the stream is closed, or :meth:`end` was called.
+            RequestError: the stream is closed, :meth:`end` was called, or there is no such view.
         """
         self._check_accepts()
+        return self._put([self._taken(frame, depth, flow, time, view)])
+
+    def put_many(
+        self,
+        frames: Array,
+        views: Sequence[str] | None = None,
+        times: Sequence[float] | None = None,
+    ) -> bool:
+        """Pass a frame of each of several views to the stream's thread, like one :meth:`put`.
+
+        Small frames are developed together. :meth:`get` returns their pictures in this order.
+
+        >>> import numpy as np
+        >>> import clpipe
+        >>> rig = {"left": {"iso": 100}, "right": {"iso": 400}}
+        >>> with clpipe.Stream(device="numpy", views=rig) as stream:
+        ...     taken = stream.put_many(np.full((2, 24, 32, 3), 0.05, np.float32))
+        ...     [(shot.view, shot.index, shot.camera.iso) for shot in stream.finish()]
+        [('left', 0, 100.0), ('right', 0, 400.0)]
+
+        Args:
+            frames: (view, height, width, 3).
+            views: the names of their views; None is all views of the stream.
+            times: their times, s.
+
+        Raises:
+            ImageError: this is no array.
+            RequestError: as for :meth:`put`, or there are not as many views or times as frames.
+        """
+        self._check_accepts()
+        stack, names = as_array(frames, "frames"), [*self._views] if views is None else [*views]
+        for what, given in (("views", names), ("times", times)):
+            if given is not None and len(given) != len(stack):
+                raise RequestError(f"found {len(stack)} frames, but {len(given)} {what}")
+        return self._put(
+            [
+                self._taken(frame, None, None, times[number] if times else None, names[number])
+                for number, frame in enumerate(stack)
+            ]
+        )
+
+    def _put(self, taken: list[_Taken]) -> bool:
+        """Pass frames to the stream's thread, and return whether they were taken."""
         self._is_threaded = True
-        image, layers = as_array(frame, "frame"), _by_kind(depth, flow)
-        index = next(self._numbers)
         is_free = self._free.acquire(blocking=not self._drop)
         if self._has_ended:
             self._free.release()  # another thread may wait as well
             self._check_accepts()
         if not is_free:
-            self.dropped += 1
+            self.dropped += len(taken)
             return False
-        copied = {kind: layer.copy() for kind, layer in layers.items()}
-        self._in_thread(self._deliver, index, image.copy(), copied, time)
+        copies = [
+            replace(
+                each,
+                pixels=[frame.copy() for frame in each.pixels],
+                arrays={kind: layer.copy() for kind, layer in each.arrays.items()},
+            )
+            for each in taken
+        ]
+        self._in_thread(self._deliver, copies)
         return True
+
+    def _taken(
+        self,
+        frame: Array | Sequence[Array],
+        depth: Array | None,
+        flow: Array | None,
+        time: float | None,
+        view: str | None,
+    ) -> _Taken:
+        """Return the next frame of a view.
+
+        Raises:
+            ImageError: this is no array.
+            RequestError: there is no such view, or several.
+        """
+        if view is None and len(self._views) > 1:
+            raise RequestError(f"this stream has the views {', '.join(self._views)}; name one")
+        name = next(iter(self._views)) if view is None else view
+        if name not in self._views:
+            raise RequestError(unknown_name("view", name, self._views))
+        frames = frame if isinstance(frame, list | tuple) and frame else [frame]
+        pixels = [as_array(each, "frame") for each in frames]
+        found = self._views[name]
+        return _Taken(found, next(found.numbers), pixels, _by_kind(depth, flow), time)
 
     def get(self, timeout: float | None = None) -> Shot | None:
         """Return the next picture, in the order of the frames. None if there will be no more.
@@ -276,10 +435,14 @@ class Stream:
             raise TimeoutError("no picture yet") from None
         if found is None:
             self._shots.put(None)  # for the next call
-        self._free.release()
-        if isinstance(found, Exception):
-            raise found
-        return None if found is None else self._announced(*found)
+            self._free.release()
+            return None
+        shot, is_last = found
+        if is_last:
+            self._free.release()
+        if isinstance(shot, Exception):
+            raise shot
+        return self._announced(*shot)
 
     def end(self) -> None:
         """Accept no more frames. The pictures of earlier frames can still be fetched.
@@ -355,21 +518,27 @@ class Stream:
     def _announced(self, shot: Shot, warnings: Iterable[str]) -> Shot:
         """Return a picture, and issue the new kinds of warnings about it in the user's thread."""
         for text in self._issued.new(warnings):
-            self._warn(f"{self._key(shot.index)}: {text}")
+            self._warn(f"{key_of(self._views[shot.view], shot.index)}: {text}")
         return shot
 
     _warn = staticmethod(warn)
 
-    def _key(self, index: int) -> str:
-        """Return the image key of a frame, without the digest of its pixels."""
-        return f"{self._name}/{index:06}"
-
-    def _deliver(self, *frame: Any) -> None:
-        """Develop a frame for :meth:`get`."""
-        try:
-            self._shots.put(self._next_shot(*frame))
-        except Exception as error:
-            self._shots.put(error)
+    def _deliver(self, taken: Sequence[_Taken]) -> None:
+        """Develop frames for :meth:`get`, together if they have no state."""
+        parts = [_attempted(partial(self._prepared, each)) for each in taken]
+        ready = [part for part in parts if isinstance(part, _Part)]
+        waits: list[Callable[[], Result]] = [partial(self._developed, part) for part in ready]
+        if len(taken) > 1 and not has_state(self._pipeline.chain):
+            waits = self._pipeline.develop_many([part.prepared for part in ready])
+        pending = iter(waits)
+        for number, part in enumerate(parts, 1):
+            found: _Found
+            if isinstance(part, _Part):
+                result = _attempted(next(pending))
+                found = result if isinstance(result, Exception) else self._shot(part, result)
+            else:
+                found = part
+            self._shots.put((found, number == len(parts)))
 
     def _rehearse(self, frame: Array) -> None:
         """Develop frames like those to come, with loops and state that are then dropped.
@@ -379,19 +548,27 @@ class Stream:
         as_image(self._light(frame), self._pipeline.chain.source, self._pipeline.chain.bands)
         height, width = frame.shape[:2]
         layers = _by_kind(np.ones((height, width)), np.zeros((height, width, 2)))
-        meter, state = self._pipeline.meter(), State()
-        for index in range(2) if self._pipeline.device else ():  # NumPy compiles nothing
-            self._develop(index, frame, layers, meter, state)
+        for view in self._views.values() if self._pipeline.device else ():  # NumPy compiles nothing
+            copy = _View(view.name, view.key, view.settings, self._pipeline.meter())
+            for index in range(2):
+                self._next_shot(_Taken(copy, index, [frame], layers, None))
 
-    def _next_shot(
-        self, index: int, frame: Array, arrays: Mapping[str, Array], time: float | None
-    ) -> tuple[Shot, tuple[str, ...]]:
-        """Develop the next frame, with its time. The rest is that of :meth:`_develop`."""
+    def _next_shot(self, taken: _Taken) -> tuple[Shot, tuple[str, ...]]:
+        """Develop a frame, and return its picture and warnings.
+
+        Raises:
+            ImageError, RequestError, DeviceError: the frame cannot be developed.
+        """
+        part = self._prepared(taken)
+        return self._shot(part, self._developed(part))
+
+    def _developed(self, part: _Part) -> Result:
+        """Develop the next frame of a view."""
+        view = part.taken.view
         try:
-            shot, warnings = self._develop(index, frame, arrays, self._meter, self._state)
-            return replace(shot, time=time), warnings
+            return self._pipeline.develop(part.prepared, view.state)
         except (DeviceError, DeviceFailedError):
-            self._state = State()  # the next frame starts again
+            view.state = State()  # the next frame starts again
             raise
 
     def _light(self, frame: Array) -> Array:
@@ -409,42 +586,56 @@ class Stream:
             )
         return SRGB.take(frame, mode="clip")
 
-    def _develop(
-        self, index: int, frame: Array, arrays: Mapping[str, Array], meter: Meter, state: State
-    ) -> tuple[Shot, tuple[str, ...]]:
-        """Meter a frame, run the chain with its settings, and return its picture and warnings.
-
-        Args:
-            index: the number of the frame.
-            frame: its pixels.
-            arrays: its layers, by kind.
-            meter: the loops of the sequence.
-            state: the results of the frame before.
+    def _prepared(self, taken: _Taken) -> _Part:
+        """Meter a frame, and return it with its chain.
 
         Raises:
             ImageError, RequestError, DeviceError: the frame cannot be developed.
         """
-        pipeline, key = self._pipeline, self._key(index)
-        drawn = pipeline.settings.drawn_values(self._name, index)
-        first = pipeline.prepare(self._light(frame), key, arrays, NO_MARGINS, drawn)
+        pipeline, view = self._pipeline, taken.view
+        key = key_of(view, taken.index)
+        drawn = merged(pipeline.settings.drawn_values(view.key, taken.index), view.settings)
+        light = pipeline.exposed([self._light(each) for each in taken.pixels], key, drawn)
+        first = pipeline.prepare(light, key, taken.arrays, NO_MARGINS, drawn)
 
         def prepared_with(values: Mapping[str, Any]) -> Prepared:
             settings = merged(drawn, values)
-            return pipeline.prepare(first.pixels, key, arrays, NO_MARGINS, settings, first)
+            return pipeline.prepare(first.pixels, key, taken.arrays, NO_MARGINS, settings, first)
 
-        reading = meter.read(
+        reading = view.meter.read(
             first.chain,
             first.pixels,
             first.own_key,
-            index,
+            taken.index,
             lambda values: prepared_with(values).chain,
         )
         prepared = prepared_with(reading.values) if reading.values else first
-        result = pipeline.develop(prepared, state)
+        return _Part(taken, prepared, reading.metered, merged(drawn, reading.values))
+
+    @staticmethod
+    def _shot(part: _Part, result: Result) -> tuple[Shot, tuple[str, ...]]:
+        """Return a picture and its warnings."""
+        taken, prepared = part.taken, part.prepared
         is_raw = prepared.chain.result is Kind.RAW
         image = result.image.astype(np.uint16) if is_raw else result.image
-        settings = merged(drawn, reading.values)
-        return Shot(index, image, settings, reading.metered, result), prepared.warnings
+        facts = part.metered, result, taken.time, taken.view.name
+        return Shot(taken.index, image, part.settings, *facts), prepared.warnings
+
+
+_Found = tuple[Shot, tuple[str, ...]] | Exception
+
+
+def _attempted(function: Callable[[], T]) -> T | Exception:
+    """Return the result of a function, or its error."""
+    try:
+        return function()
+    except Exception as error:
+        return error
+
+
+def key_of(view: _View, index: int) -> str:
+    """Return the image key of a frame, without the digest of its pixels."""
+    return f"{view.key}/{index:06}"
 
 
 def _by_kind(depth: Array | None, flow: Array | None) -> dict[str, Array]:

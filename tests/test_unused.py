@@ -51,4 +51,4 @@ def test_pipelines_and_streams_name_it_in_their_own_words():
     with pytest.warns(UserWarning, match=r"control.delay acts .*; use clpipe.Stream, or remove it"):
         api.Pipeline(device="numpy", control={"delay": 3})
     with pytest.warns(UserWarning, match="shutter.subframes averages the files of an exposure"):
-        api.Stream(device="numpy", shutter={"subframes": 3})
+        api.Pipeline(device="numpy", shutter={"subframes": 3})

@@ -84,10 +84,10 @@ def _of_shutter(settings: Settings, chain: Chain, images: ImageFacts) -> Iterato
     shutter = chain.step_in(StageRole.SHUTTER)
     if shutter is None or not isinstance(shutter.method, Rows):
         return
-    if shutter.method.subframes > 1 and not images.from_files:
+    if shutter.method.subframes > 1 and not (images.from_files or images.is_sequence):
         yield (
             f"{shutter.name}.subframes averages the files of an exposure, but each image is one "
-            "array; average the arrays first"
+            "array; average the arrays first, or use clpipe.Stream"
         )
     given = [name for name in OF_ROWS if name in settings.table(shutter.name)]
     if given and not shutter.method.changes_light and not images.needs_rows:

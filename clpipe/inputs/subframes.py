@@ -132,9 +132,9 @@ def average(
         if light and light.wavelengths != source.wavelengths:
             raise _other_bands(path, job)
         for total, (unlit, extra) in zip(totals, weights, strict=True):
-            _add(total, unlit[number], pixels)
+            add_frame(total, unlit[number], pixels)
             if light:
-                _add(total, extra[number], light.pixels)
+                add_frame(total, extra[number], light.pixels)
         warnings = (*source.warnings, *(light.warnings if light else ()))
         found.append(replace(source, pixels=np.empty(0, pixels.dtype), warnings=warnings))
         del source, light, pixels  # before the next frame is read
@@ -218,7 +218,7 @@ def _check_numbers(jobs: Sequence[Job]) -> None:
         )
 
 
-def _add(total: Floats, weights: Doubles, pixels: Array) -> None:
+def add_frame(total: Floats, weights: Doubles, pixels: Array) -> None:
     """Add an image to a sum, multiplied by a weight for each row."""
     used = np.flatnonzero(weights)
     end = int(used[-1]) + 1 if used.size else 0
