@@ -2,11 +2,13 @@
 // gives it the third moment of shot noise (Cornish and Fisher 1938).
 #include "lib/tukey_lambda.h"
 
-// The variance that this adds is removed from z's own part, except for its square.
+// The variance that this adds is removed from z's own part, except for its square. With little or no
+// read noise, a signal below 0.25 electrons has more skew than this approximation supports.
 INLINE vf skewed(vf z, vf y, float a, float b) {
     const vf shot = vmax(a * y, (vf)(0.0f)), variance = vmax(a * y + b, (vf)(1e-30f));
     const vf inverse = inverse_root(variance);
-    const vf skew = shot * inverse * inverse * (a * 0.16666667f);
+    const vf sigma = variance * inverse;
+    const vf skew = vmin(shot * inverse * inverse * (a * 0.16666667f), sigma * 0.33333334f);
     const vf linear = (variance - skew * skew) * inverse;
     return (linear + skew * z) * z - skew;
 }

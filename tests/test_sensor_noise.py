@@ -123,6 +123,17 @@ def test_the_skew_is_that_of_shot_noise(develop, electrons, read_noise):
     assert abs((gaussian.astype(np.float64) ** 3).mean()) < 0.1 * a**3 * variance**1.5
 
 
+@pytest.mark.parametrize("read_noise", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("electrons", [0.2, 0.03, 1e-3, 1e-8, 1e-24])
+def test_the_noise_of_little_light_is_little(develop, electrons, read_noise):
+    a = 1e-3
+    variance = a**2 * (electrons + read_noise**2)
+    given = {"method": "skewed_gaussian", "a": a, "b": (a * read_noise) ** 2}
+    noise = draw(develop, a * electrons, 300_000, **given) - np.float32(a * electrons)
+    assert noise.var(dtype=np.float64) == pytest.approx(variance, rel=0.04, abs=0)
+    assert abs(noise.mean(dtype=np.float64)) < 0.02 * sqrt(variance)
+
+
 def test_a_full_well_holds_no_more(develop):
     given = {"a": 1e-3, "full_well": 500.0, "b": 0.0}
     for method in ("skewed_gaussian", "gaussian", "poisson"):
