@@ -16,9 +16,11 @@ class SkewedGaussian(Gaussian):
     A Poisson number of mean m is m + sqrt(m) z + (z^2 - 1)/6 + ..., with z a standard normal
     (Cornish and Fisher, Rev. Int. Stat. Inst. 1938). The noise is therefore s z + c (z^2 - 1). Its
     factors are c = a^2 y / (6 (a*y + b)) and s^2 = a*y + b - 2 c^2. Above 0.3 electrons it is
-    accurate to 1 %. Below that, without read noise, c is limited to a third of the standard
-    deviation, so the variance remains accurate to 2 %, and the skew is smaller than a photon's. In shadows it has few bright outliers and no dark ones, like a camera's noise.
+    accurate to 1 %. In shadows it has few bright outliers and no dark ones, like a camera's noise.
     It costs as much as a Gaussian.
+
+    Below 0.25 electrons and with little read noise, c would exceed a third of the standard
+    deviation. It is limited to that. The variance remains accurate to 2 %, with less skew.
 
     The noisy signal is limited to the full well. With ``tukey_lambda``, the read noise, of variance
     b, is drawn from a Tukey lambda distribution instead and added after this limit.
