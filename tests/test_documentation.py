@@ -156,7 +156,7 @@ CHECKS = {
     "docs/recipes/blender.md": the_drawn_values,
     "docs/recipes/cluster.md": the_whole_in_shards,
     "docs/recipes/real_camera.md": the_camera_that_was_simulated,
-    "docs/recipes/simulator.md": the_pictures_of_the_pipe,
+    "docs/robotics.md": the_pictures_of_the_pipe,
 }
 
 

@@ -11,7 +11,7 @@ import clpipe
 from tests.conftest import ROOT
 from tests.markdown import blocks
 
-PAGE = ROOT / "docs" / "recipes" / "simulator.md"
+PAGE = ROOT / "docs" / "robotics.md"
 VIDEO = "observation.images.front"
 
 

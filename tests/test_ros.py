@@ -8,7 +8,7 @@ from clpipe.camera.profile import load_camera
 from tests.conftest import ROOT
 from tests.markdown import blocks
 
-PAGE = ROOT / "docs" / "recipes" / "simulator.md"
+PAGE = ROOT / "docs" / "robotics.md"
 
 
 def test_a_bag_has_the_raws_and_their_camera(tmp_path, monkeypatch):

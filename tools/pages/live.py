@@ -1,6 +1,9 @@
-"""Time clpipe.Stream at the rate of a camera: pictures per second, latency, dropped frames.
+"""Time clpipe.Stream: at the rate of a camera by chain, and as fast as it can by size.
 
 sh tools/run pages live --seconds 60
+
+The first table has pictures per second, latency and dropped frames. The second one has the time of
+a call, and the pictures per second of put and get.
 """
 
 import threading
@@ -23,6 +26,9 @@ CHAINS: dict[str, dict] = {
     "-c video": {"config": "video"},
 }
 
+SIZES = ((160, 120), (320, 240), (640, 480), (1280, 720), (1920, 1080))
+FAST = ("default", "raw", "auto exposure and ISO")  # the chains that are timed by size
+
 
 def frames_of(count: int, width: int, height: int, is_srgb: bool) -> list[np.ndarray]:
     """Return frames of smooth random light, or of its codes."""
@@ -40,6 +46,7 @@ def measure(
     sent: dict[int, float] = {}
     late: list[float] = []
     with clpipe.Stream(iso=800, drop=True, **options) as stream:
+        stream.warm_up(frames[0].shape, frames[0].dtype)
 
         def read() -> None:
             for shot in iter(stream.get, None):
@@ -49,7 +56,7 @@ def measure(
         reader.start()
         count = int(rate * seconds)
         start = time.perf_counter() + 1
-        for number in range(-int(rate), count):  # the first second compiles
+        for number in range(-int(rate), count):  # the first second settles
             time.sleep(max(0.0, start + number / rate - time.perf_counter()))
             sent[number + int(rate)] = time.perf_counter()
             stream.put(frames[number % len(frames)])
@@ -62,8 +69,31 @@ def measure(
         return len(late) / elapsed, float(np.median(late)), max(late), stream.dropped - dropped
 
 
+def fastest(options: dict, width: int, height: int, seconds: float) -> tuple[float, float]:
+    """Return the median time of a call in ms, and the pictures per second of put and get."""
+    frames = frames_of(4, width, height, False)
+    with clpipe.Stream(iso=800, **options) as stream:
+        stream.warm_up(frames[0].shape)
+        times = []
+        end = time.perf_counter() + seconds / 2
+        while time.perf_counter() < end:
+            began = time.perf_counter()
+            stream(frames[len(times) % 4])
+            times.append(time.perf_counter() - began)
+    with clpipe.Stream(iso=800, **options) as stream:
+        stream.warm_up(frames[0].shape)
+        began, count = time.perf_counter(), 0
+        stream.put(frames[0])
+        while time.perf_counter() < began + seconds / 2:
+            stream.put(frames[count % 4])
+            stream.get()
+            count += 1
+        rate = count / (time.perf_counter() - began)
+    return 1e3 * float(np.median(times)), rate
+
+
 def main() -> None:
-    """Print a table with a row for each chain."""
+    """Print a table with a row for each chain, and one with a row for each size."""
     parser = parser_of(__doc__)
     size = (1280, 720)
     parser.add_argument("--size", type=sides_of, default=size, help="the size of frames in px")
@@ -76,6 +106,14 @@ def main() -> None:
         rows.append([name, f"{rate:.1f}", *(f"{each:.2f}" for each in late), dropped])
     heads = ["chain", "pictures per second", "latency in frames, median", "largest", "dropped"]
     print(markdown(heads, rows))
+    rows = []
+    for width, height in SIZES:
+        found = [fastest(CHAINS[name], width, height, arguments.seconds / 5) for name in FAST]
+        rows.append(
+            [f"{width}x{height}", *(f"{float(f'{each:.3g}'):g}" for pair in found for each in pair)]
+        )
+    columns = [f"{name}: {what}" for name in FAST for what in ("call, ms", "pictures per second")]
+    print(markdown(["size", *columns], rows))
 
 
 if __name__ == "__main__":
