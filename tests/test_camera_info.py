@@ -145,3 +145,17 @@ def _camera(folder):
     lens = {"method": "brown_conrady", "fx": 30}
     [sample] = clpipe.Dataset(folder, device="numpy", distortion=lens)
     return sample
+
+
+def test_auto_iso_changes_the_exposure_time_only_by_the_rest():
+    options = {"shutter": {"exposure_time": 0.01, "flicker_depth": 0.1}, "iso": 100}
+    frame = np.full((12, 16, 3), 0.012, np.float32)
+    control = {"iso_max": 800.0}
+    exposure = {"method": "auto"}
+    with clpipe.Stream(device="numpy", exposure=exposure, control=control, **options) as stream:
+        shot = stream(frame)
+    ev = shot.settings["exposure"]["ev"]
+    assert ev > 3.5 and shot.camera.iso == 800
+    assert shot.camera.exposure_time == pytest.approx(0.01 * 2**ev / 8)
+    with clpipe.Stream(device="numpy", exposure=exposure, **options) as stream:
+        assert stream(frame).camera.exposure_time == pytest.approx(0.01 * 2**ev, rel=1e-6)

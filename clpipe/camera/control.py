@@ -103,9 +103,14 @@ class AutoIso:
     def __init__(self, iso: float, iso_range: tuple[float, float], control: Control) -> None:
         assert control.iso_max is not None
         low, high = iso_range
-        self._iso = iso
+        self._iso = self._last = iso
         self._ends = max(control.iso_min or iso, low), min(control.iso_max, high)
         self._step: int | None = None
+
+    @property
+    def gain(self) -> float:
+        """The gain of the last ISO over the one that is set, EV."""
+        return math.log2(self._last / self._iso)
 
     def next(self, ev: float) -> float:
         """Return the ISO of the next frame, whose exposure has a gain of ``ev`` EV."""
@@ -113,4 +118,5 @@ class AutoIso:
         if self._step is None or abs(asked - self._step) > 1:
             self._step = round(asked)
         low, high = self._ends
-        return min(max(self._iso * 2 ** (self._step / ISO_STEPS), low), high)
+        self._last = min(max(self._iso * 2 ** (self._step / ISO_STEPS), low), high)
+        return self._last

@@ -142,6 +142,7 @@ class Exposure(TypedDict, total=False):
     method: Draw | Literal["gain", "auto", "photometric", "radiometric"]
     ev: Number
     headroom: Number
+    iso_ev: Number
     rule: Draw | Literal["log_average", "percentile"]
     target: Number
     metering: Draw | Literal["average", "centre_weighted", "spot"]

@@ -10,7 +10,7 @@ from clpipe.base.cache import BoundedCache
 from clpipe.base.types import Floats
 from clpipe.chain.chain import Chain, Step
 from clpipe.stage import Kind, Method, ReferenceContext, StageRole, Unchanged
-from clpipe.stages.exposure.gain import Gain
+from clpipe.stages.exposure.gain import Exposing
 
 RESPONSE_SIZE = 256  # entries of a table of the response, and of its inverse
 INVERSION_STEPS = 64  # steps between two entries when the response is inverted
@@ -47,7 +47,7 @@ def exposure_of(chain: Chain, estimates: Estimates) -> Exposure | None:
         estimates: the values that steps estimated from the image, by step name.
     """
     step = chain.step_in(StageRole.EXPOSURE)
-    if step is None or not isinstance(step.method, Gain):
+    if step is None or not isinstance(step.method, Exposing):
         return None
     metered = estimates.get(step.name, {}).get(METERED, 0.0)
     time = step.method.next_context(step.context).exposure_time

@@ -138,6 +138,7 @@ class Meter:
             if control.iso_max is not None and (is_lit or self._iso):
                 self._iso = self._iso or AutoIso(chain.iso, chain.camera.iso_range, control)
                 values["iso"] = round(self._iso.next(ev), DIGITS)
+                values[exposure.name]["iso_ev"] = round(self._iso.gain, DIGITS)
         else:
             is_lit = bool(np.any(image))
         if balance:

@@ -17,7 +17,7 @@ from clpipe.stage import (
     ReferenceContext,
     parameter,
 )
-from clpipe.stages.exposure.gain import Gain
+from clpipe.stages.exposure.gain import Exposing
 
 STEPS = 4096  # steps per factor of two; the base-2 logarithm is stored as an integer
 _PER_NEPER = np.float32(-STEPS * 1.4426950408889634)
@@ -65,7 +65,7 @@ def steps_of(level: Floats) -> NDArray[np.int64]:
     return np.rint(negative_log(level) * _PER_NEPER).astype(np.int64)
 
 
-class Auto(Gain):
+class Auto(Exposing):
     """A gain that brings the luminance of the image to a target, times 2^(ev - headroom).
 
     log_average brings ``exp(mean(log(delta + L)))`` to a key of 0.18, like SyB3R (Reinhard et al.,

@@ -8,22 +8,11 @@ from clpipe.base.types import Floats
 from clpipe.stage import Arguments, Context, Method, Pass, ReferenceContext, parameter
 
 
-class Gain(Method):
-    """Linear light times 2^(ev - headroom).
+class Exposing(Method):
+    """Base of the methods that scale linear light to a level of the sensor."""
 
-    A camera's exposure puts a white surface well below saturation, and its tone curve restores the
-    brightness. Highlights above 1.0 then roll off instead of clipping.
-
-    >>> from clpipe.stage import run_reference
-    >>> run_reference(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
-    [[[0.125, 0.25, 1.0]]]
-    """
-
-    method: ClassVar = "gain"
     kernel: ClassVar = "exposure"
     overscan: ClassVar = True
-    summary: ClassVar = "multiply linear light by 2^(ev - headroom)"
-    example: ClassVar = {"ev": 0.7}
 
     ev: float = parameter(0.0, "Exposure compensation; +1 doubles the light.", "EV", ge=-20, le=20)
     headroom: float = parameter(
@@ -64,3 +53,32 @@ class Gain(Method):
 
     def reference(self, image: Floats, inputs: ReferenceContext) -> Floats:
         return image * np.float32(self.factor(inputs.context.iso))
+
+
+class Gain(Exposing):
+    """Linear light times 2^(ev - headroom).
+
+    A camera's exposure puts a white surface well below saturation, and its tone curve restores the
+    brightness. Highlights above 1.0 then roll off instead of clipping.
+
+    >>> from clpipe.stage import run_reference
+    >>> run_reference(Gain(ev=-1.0), np.float32([[[0.5, 1, 4]]])).tolist()
+    [[[0.125, 0.25, 1.0]]]
+    """
+
+    method: ClassVar = "gain"
+    summary: ClassVar = "multiply linear light by 2^(ev - headroom)"
+    example: ClassVar = {"ev": 0.7}
+
+    iso_ev: float = parameter(
+        0.0,
+        "Part of ev that the ISO supplies, such as by auto ISO. It does not change the exposure "
+        "time.",
+        "EV",
+        ge=-20,
+        le=20,
+    )
+
+    def time(self, exposure_time: float | None) -> float | None:
+        """The exposure time, s: EVs change it, but not those of the ISO."""
+        return exposure_time and exposure_time * 2.0 ** (self.ev - self.iso_ev)

@@ -5,14 +5,14 @@ from typing import ClassVar, Self
 
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.stage import Context, optics_parameter, parameter
-from clpipe.stages.exposure.gain import Gain
+from clpipe.stages.exposure.gain import Exposing
 
 SATURATION = 78.0  # lx s at ISO 1; the exposure that saturates the sensor
 GREY = 10.0  # lx s at ISO 1; the exposure of a correctly exposed 18 % grey
 WHITE = GREY / 0.18 / SATURATION  # level of a white surface, relative to the sensor's full scale
 
 
-class Photometric(Gain):
+class Photometric(Exposing):
     """The focal-plane exposure H = q L t / N^2 over the saturation exposure, 78 lx s / ISO.
 
     L is the luminance of the scene, t the exposure time and N the f-number. q is the loss in the

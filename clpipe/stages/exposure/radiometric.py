@@ -9,11 +9,11 @@ from clpipe.base.errors import RequestError
 from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.camera.profile import Camera
 from clpipe.stage import Context, camera_parameter, optics_parameter, parameter
-from clpipe.stages.exposure.gain import Gain
+from clpipe.stages.exposure.gain import Exposing
 from clpipe.stages.exposure.photometric import WHITE
 
 
-class Radiometric(Gain):
+class Radiometric(Exposing):
     """The charge of a pixel, over the charge at which its ADC reads white.
 
     A pixel of the pitch p gets t p^2 pi / (4 N^2) times the integral of L QE wavelength / (h c)
