@@ -127,6 +127,8 @@ def _open_mapped(path: Path) -> SourceImage | None:
         pixels = np.asarray(np.load(path.with_suffix(".npy"), mmap_mode="r"))
     except (OSError, ValueError, EOFError, pickle.UnpicklingError):
         return None  # missing, or cut off because the disk was full
+    except SystemError:
+        return None  # Python 3.11 before 3.11.8 parses headers wrongly in threads (gh-106905)
     return replace(source, pixels=pixels.transpose(1, 2, 0) if planar else pixels)
 
 
