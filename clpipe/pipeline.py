@@ -34,7 +34,7 @@ from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result
 from clpipe.engine.service import Frame, Service, picture
 from clpipe.engine.state import State
-from clpipe.images.arrays import as_array, as_image
+from clpipe.images.arrays import as_array, as_image, as_stack
 from clpipe.images.kinds import MIN_CHANNELS, flow_vectors
 from clpipe.reference.carried import RESAMPLING, Layer, LayerKind, warp
 from clpipe.reference.geometry import NO_MARGINS, Margins
@@ -396,10 +396,10 @@ class Pipeline(ReadOnly):
         is_stack = any(hasattr(images, name) for name in ("__dlpack__", "__array_interface__"))
         if is_stack:
             with errors_in_python():
-                stack = as_array(images, "images")
+                stack = as_stack(images, "images", names=names, views=views, times=times)
                 yield from self._process_stack(stack, names, views, times, settings)
             return
-        if names or views or times:
+        if any(given is not None for given in (names, views, times)):
             raise RequestError(
                 "names, views and times belong to the views of a stack, (view, height, width, 3); "
                 "for other images, pass pairs of an image and its arguments"
@@ -420,19 +420,15 @@ class Pipeline(ReadOnly):
         settings: Mapping[str, Any],
     ) -> list[Result]:
         """Return the results of the views of a stack, see :meth:`process_many`."""
-        count = len(stack)
-        for what, given in (("names", names), ("views", views), ("times", times)):
-            if given is not None and len(given) != count:
-                raise RequestError(f"found {len(given)} {what}, but the stack has {count} views")
-        keys = names or [self._next_key() for _ in range(count)]
-        own = [{**settings, **each} for each in views] if views else [settings] * count
+        keys = [self._next_key() for _ in stack] if names is None else names
+        own = [{**settings, **each} for each in views or [{}] * len(stack)]
         triples = zip(stack, keys, own, strict=True)
         prepared = [self.prepare(view, key, {}, NO_MARGINS, one) for view, key, one in triples]
         frames = [self._frame(each, RunOptions()) for each in prepared]
         results = []
         for number, development in enumerate(self._service.develop(frames)):
             result = self._with_origin(development.result(), prepared[number])
-            if times:
+            if times is not None:
                 result = replace(result, time=float(times[number]))
             self._announce(keys[number], prepared[number], result)
             results.append(result)

@@ -25,7 +25,7 @@ from clpipe.engine.options import RunOptions
 from clpipe.engine.runner import Result
 from clpipe.engine.service import Development
 from clpipe.engine.state import State, has_state
-from clpipe.images.arrays import as_array, as_image
+from clpipe.images.arrays import as_array, as_image, as_stack
 from clpipe.inputs.metering import Meter, merged
 from clpipe.inputs.subframes import add_frame, weights_of
 from clpipe.pipeline import Pipeline, Prepared
@@ -308,7 +308,9 @@ class Stream:
         self._check_accepts()
         if self._is_threaded:
             raise RequestError("this stream develops the frames of put; use get, not a call")
-        return self._announced(*self._next_shot(self._taken(frame, depth, flow, time, view)))
+        return self._announced(
+            *self._next_shot(self._taken(frame, depth, flow, time, self._view(view)))
+        )
 
     def put(
         self,
@@ -331,7 +333,7 @@ class Stream:
             RequestError: the stream is closed, :meth:`end` was called, or there is no such view.
         """
         self._check_accepts()
-        return self._put([self._taken(frame, depth, flow, time, view)])
+        return self._put([self._taken(frame, depth, flow, time, self._view(view))])
 
     def put_many(
         self,
@@ -361,16 +363,13 @@ class Stream:
             RequestError: as for :meth:`put`, or there are not as many views or times as frames.
         """
         self._check_accepts()
-        stack, names = as_array(frames, "frames"), [*self._views] if views is None else [*views]
-        for what, given in (("views", names), ("times", times)):
-            if given is not None and len(given) != len(stack):
-                raise RequestError(f"found {len(stack)} frames, but {len(given)} {what}")
-        return self._put(
-            [
-                self._taken(frame, None, None, times[number] if times else None, names[number])
-                for number, frame in enumerate(stack)
-            ]
-        )
+        names = [*self._views] if views is None else views
+        stack = as_stack(frames, "frames", views=names, times=times)
+        moments = [None] * len(stack) if times is None else times
+        found = [self._view(name) for name in names]
+        frames_of_views = zip(stack, moments, found, strict=True)
+        taken = [self._taken(frame, None, None, *facts) for frame, *facts in frames_of_views]
+        return self._put(taken) if taken else True
 
     def _put(self, taken: list[_Taken]) -> bool:
         """Pass frames to the stream's thread, and return whether they were taken."""
@@ -393,29 +392,35 @@ class Stream:
         self._in_thread(self._deliver, copies)
         return True
 
+    def _view(self, name: str | None) -> _View:
+        """Return a view by its name; None is the only one.
+
+        Raises:
+            RequestError: there is no such view, or there are several.
+        """
+        if name is None and len(self._views) > 1:
+            raise RequestError(f"this stream has the views {', '.join(self._views)}; name one")
+        name = next(iter(self._views)) if name is None else name
+        if name not in self._views:
+            raise RequestError(unknown_name("view", name, self._views))
+        return self._views[name]
+
+    @staticmethod
     def _taken(
-        self,
         frame: Array | Sequence[Array],
         depth: Array | None,
         flow: Array | None,
         time: float | None,
-        view: str | None,
+        view: _View,
     ) -> _Taken:
         """Return the next frame of a view.
 
         Raises:
             ImageError: this is no array.
-            RequestError: there is no such view, or several.
         """
-        if view is None and len(self._views) > 1:
-            raise RequestError(f"this stream has the views {', '.join(self._views)}; name one")
-        name = next(iter(self._views)) if view is None else view
-        if name not in self._views:
-            raise RequestError(unknown_name("view", name, self._views))
         frames = frame if isinstance(frame, list | tuple) and frame else [frame]
-        pixels = [as_array(each, "frame") for each in frames]
-        found = self._views[name]
-        return _Taken(found, next(found.numbers), pixels, _by_kind(depth, flow), time)
+        pixels, arrays = [as_array(each, "frame") for each in frames], _by_kind(depth, flow)
+        return _Taken(view, next(view.numbers), pixels, arrays, time)
 
     def get(self, timeout: float | None = None) -> Shot | None:
         """Return the next picture, in the order of the frames. None if there will be no more.

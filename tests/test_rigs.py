@@ -81,10 +81,26 @@ def test_rejected_views():
         ):
             with pytest.raises(RequestError, match=message):
                 stream(FRAMES[0, 0], **arguments)
-        with pytest.raises(RequestError, match="found 1 frames, but 2 views"):
+        with pytest.raises(RequestError, match="found 2 views, but the stack has 1 views"):
             stream.put_many(FRAMES[0, :1])
-        with pytest.raises(RequestError, match="found 2 frames, but 1 times"):
+        with pytest.raises(RequestError, match="found 1 times, but the stack has 2 views"):
             stream.put_many(FRAMES[0], times=[0.0])
+
+
+def test_what_is_rejected_or_empty_takes_no_place():
+    with clpipe.Stream(device="numpy", views=RIG) as stream:
+        with pytest.raises(RequestError, match="unknown view 'top'"):
+            stream.put_many(FRAMES[0], views=["left", "top"])
+        with pytest.raises(ImageError, match="a stack of images is expected"):
+            stream.put_many(np.float32(3))
+        for _ in range(3):  # more than there are places
+            assert stream.put_many(FRAMES[0, :0], views=[])
+        assert stream.put_many(FRAMES[0], times=np.array([0.0, 0.5]))
+        shots = list(stream.finish())
+    assert [(shot.view, shot.index, shot.time) for shot in shots] == [
+        ("left", 0, 0.0),
+        ("right", 0, 0.5),
+    ]
 
 
 def test_subframes_are_those_of_files(write_exr, clpipe):

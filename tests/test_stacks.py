@@ -70,12 +70,21 @@ def test_launches_are_shared(launches):
         ((VIEWS[:3], None, [{}]), "found 1 views, but the stack has 3 views"),
         (([VIEWS[0]], ["a"]), "belong to the views of a stack"),
         ((VIEWS[0],), "expected"),
+        ((np.float32(3),), "a stack of images is expected"),
         ((VIEWS[:2, ..., :2],), "is expected"),
     ],
 )
 def test_rejected_stacks(arguments, message):
     with pytest.raises((RequestError, ImageError), match=message):
         list(clpipe.Pipeline(device="numpy").process_many(*arguments))
+
+
+def test_names_and_times_may_be_arrays():
+    camera = clpipe.Pipeline(device="numpy", iso=800)
+    names, times = np.array(["a", "b"]), np.array([0.0, 0.5])
+    found = list(camera.process_many(VIEWS[:2], names, times=times))
+    assert [each.camera.time for each in found] == [0.0, 0.5]
+    assert np.array_equal(found[1].image, camera.process(VIEWS[1], "b").image)
 
 
 class Interface:

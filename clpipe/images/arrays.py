@@ -1,11 +1,12 @@
 """Arrays as images: converted if their meaning is unambiguous, otherwise rejected with advice."""
 
+from collections.abc import Sequence
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from clpipe.base.errors import ImageError
+from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.memory import release_pages
 from clpipe.base.types import Array
 from clpipe.stage import Kind
@@ -47,6 +48,32 @@ def as_array(value: Any, what: str) -> Array:
             f"{what} is a {kind} whose memory cannot be shared ({error}). If it is on a GPU, pass "
             f"{what}.cpu()"
         ) from None
+
+
+def as_stack(value: Any, what: str, **given: Sequence[Any] | None) -> Array:
+    """Return a stack of images as an array, (view, height, width[, 3]).
+
+    Args:
+        value: the stack, as for :func:`as_array`.
+        what: its name, for the message.
+        **given: what belongs to each view, by name; None if there is nothing.
+
+    Raises:
+        ImageError: it is no stack.
+        RequestError: something is not given as often as there are views.
+    """
+    stack = as_array(value, what)
+    if stack.ndim < 3:
+        raise ImageError(
+            f"{what} has shape {stack.shape}, but a stack of images is expected: "
+            "(view, height, width, 3)"
+        )
+    for name, each in given.items():
+        if each is not None and len(each) != len(stack):
+            raise RequestError(
+                f"found {len(each)} {name}, but the stack has {len(stack)} views; pass one for each"
+            )
+    return stack
 
 
 def as_image(value: Any, kind: Kind, bands: int = 0) -> Array:
