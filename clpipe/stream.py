@@ -367,8 +367,10 @@ class Stream:
         stack = as_stack(frames, "frames", views=names, times=times)
         moments = [None] * len(stack) if times is None else times
         found = [self._view(name) for name in names]
-        frames_of_views = zip(stack, moments, found, strict=True)
-        taken = [self._taken(frame, None, None, *facts) for frame, *facts in frames_of_views]
+        taken = [
+            self._taken(frame, None, None, time, view)
+            for frame, time, view in zip(stack, moments, found, strict=True)
+        ]
         return self._put(taken) if taken else True
 
     def _put(self, taken: list[_Taken]) -> bool:
