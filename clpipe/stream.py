@@ -19,6 +19,7 @@ from clpipe.base.types import Array
 from clpipe.base.user_warnings import Issued, warn
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.camera_info import CameraInfo
+from clpipe.chain.keys import RENDER
 from clpipe.chain.options import Transfer
 from clpipe.chain.registry import stage_in
 from clpipe.engine.options import RunOptions
@@ -602,11 +603,15 @@ class Stream:
         pipeline, view = self._pipeline, taken.view
         key = key_of(view, taken.index)
         drawn = merged(pipeline.settings.drawn_values(view.key, taken.index), view.settings)
-        light = pipeline.exposed([self._light(each) for each in taken.pixels], key, drawn)
+        frames = [self._light(each) for each in taken.pixels]
+        light = pipeline.exposed(frames, key, drawn)
         first = pipeline.prepare(light, key, taken.arrays, NO_MARGINS, drawn)
 
         def prepared_with(values: Mapping[str, Any]) -> Prepared:
             settings = merged(drawn, values)
+            if len(frames) > 1 and RENDER in values:  # the rows of another exposure time
+                light = pipeline.exposed(frames, key, settings)
+                return pipeline.prepare(light, key, taken.arrays, NO_MARGINS, settings)
             return pipeline.prepare(first.pixels, key, taken.arrays, NO_MARGINS, settings, first)
 
         reading = view.meter.read(

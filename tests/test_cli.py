@@ -108,7 +108,7 @@ def test_a_configuration_with_options_over_it(clpipe, small, tmp_path):
     stages = {s["name"]: s["parameters"] for s in sidecar["stages"]}
     assert sidecar["iso"] == 400
     assert stages["mosaic"] == {"pattern": "GBRG"}
-    assert stages["exposure"] == {"ev": -1, "headroom": 1, "iso_ev": 0}
+    assert stages["exposure"] == {"ev": -1, "headroom": 1, "sets_time": True}
     assert not {"denoise", "row_noise"} & set(stages)
 
 

@@ -13,7 +13,7 @@ import clpipe
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import FreeMemory
 from clpipe.batch import memory_budget, threads
-from clpipe.camera.control import AutoIso, Control, ControlLoop
+from clpipe.camera.control import AutoExposure, Control, ControlLoop
 from clpipe.chain.drawing import draw_values
 from clpipe.chain.draws import Drift
 from clpipe.chain.files import load_settings
@@ -23,7 +23,10 @@ from clpipe.inputs.loader import ImageLoader
 from clpipe.inputs.manifest import read_manifest
 from clpipe.inputs.metering import write_exposures
 from clpipe.inputs.sequences import in_sequences, summary
+from clpipe.inputs.subframes import weights_of
+from clpipe.reference.geometry import NO_MARGINS
 from clpipe.stages import DEFAULT_CHAIN
+from clpipe.stages.shutter import Rows
 from tests.conftest import ROOT
 
 LOOPS = {"exposure": {"method": "auto"}, "white_balance": {"method": "gray_world"}}
@@ -97,14 +100,107 @@ def test_a_loop_ignores_changes_within_its_hysteresis():
     assert [loop.next(v) for v in (1.0, 1.15, 0.85, 1.25, 1.1)] == [1.0, 1.0, 1.0, 1.25, 1.25]
 
 
+def isos_of(auto, evs):
+    return [auto.next(ev, 200.0, 0.01).iso for ev in evs]
+
+
 def test_auto_iso_is_in_thirds_of_a_stop_and_does_not_flutter():
-    auto = AutoIso(200.0, (50, 6400), Control(iso_max=3200.0, iso_min=100.0))
-    isos = [auto.next(ev) for ev in np.linspace(-3, 6, 400)]
-    assert (min(isos), max(isos)) == (100, 3200)
-    assert {round(3 * math.log2(iso / 100), 9) % 1 for iso in isos} == {0}
-    auto = AutoIso(200.0, (50, 6400), Control(iso_max=3200.0))
-    assert AutoIso(200.0, (200, 1600), Control(iso_max=3200.0)).next(9.0) == 1600
-    assert len({auto.next(0.5 + 0.08 * (-1) ** n) for n in range(20)}) == 1
+    auto = AutoExposure((50, 6400), Control(iso_max=3200.0, iso_min=100.0))
+    isos = isos_of(auto, np.linspace(-3, 6, 400))
+    assert (min(isos), max(isos)) == pytest.approx((100, 3200))
+    assert {round(3 * math.log2(iso / 100), 6) % 1 for iso in isos} == {0}
+    [highest] = isos_of(AutoExposure((200, 1600), Control(iso_max=3200.0)), [9.0])
+    assert highest == pytest.approx(1600)
+    auto = AutoExposure((50, 6400), Control(iso_max=3200.0))
+    assert len({*isos_of(auto, [0.5 + 0.08 * (-1) ** n for n in range(20)])}) == 1
+
+
+EVS = np.linspace(-6, 12, 700)
+
+
+@pytest.mark.parametrize("mains", [None, 50.0, 60.0])
+@pytest.mark.parametrize("time_max", [None, 0.004, 0.01, 0.033])
+def test_auto_exposure_lengthens_the_time_and_then_raises_the_iso(mains, time_max):
+    control = Control(iso_max=3200.0, time_max=time_max, mains=mains)
+    auto = AutoExposure((50, 6400), control)
+    iso, time = 200.0, 0.01
+    for ev in EVS:
+        found = auto.next(float(ev), iso, time)
+        light = math.log2(found.time / time * found.iso / iso)
+        assert light == pytest.approx(found.ev)  # time and ISO supply all of the exposure
+        assert 200 <= found.iso <= 3200.001
+        longest = time_max or time
+        if time_max:
+            assert found.time <= longest * (1 + 1e-9)
+        else:
+            assert found.ev == pytest.approx(ev)
+        halves = found.time * 2 * (mains or 0)
+        assert halves < 1 or halves == pytest.approx(round(halves))
+        longest_used = (
+            longest - longest % (0.5 / mains) if mains and longest * mains > 0.5 else longest
+        )
+        if found.ev < ev - 1e-9:  # as bright as it gets
+            assert found.iso == pytest.approx(3200) and found.time == pytest.approx(longest_used)
+        if found.iso > 401:  # less than a stop makes up for steps of the time
+            assert found.time >= longest_used * 2 ** (-2 / 3) * (1 - 1e-9)
+
+
+def test_mains_needs_auto_iso():
+    with pytest.raises(RequestError, match="mains needs iso_max"):
+        clpipe.Stream(device="numpy", control={"mains": 50.0})
+
+
+BANDED = {"line_time": 1e-3, "flicker_depth": 1.0, "flicker_frequency": 100.0}
+
+
+def test_anti_flicker_leaves_no_bands():
+    scene = np.full((24, 32, 3), 0.01, np.float32)
+    options = {"exposure": {"method": "auto"}, "shutter": BANDED, "iso": 100, "device": "numpy"}
+    options |= {"render": {"exposure_time": 0.004}, "stages": ["shutter", "exposure", "gamma"]}
+    loops = {"iso_max": 3200.0, "time_max": 0.015}
+    bands, times = [], []
+    for mains in ({}, {"mains": 50.0}):
+        with clpipe.Stream(control={**loops, **mains}, **options) as stream:
+            shot = stream(scene)
+        bands.append(np.ptp(shot.image[:, 16, 1].astype(int)))
+        times.append(shot.camera.exposure_time)
+        assert shot.settings["render"]["exposure_time"] == pytest.approx(times[-1])
+        assert shot.camera.row_time == 1e-3
+    assert bands[0] > 10 and bands[1] <= 1
+    assert 0.0094 < times[0] <= 0.015 and times[1] == pytest.approx(0.01)
+
+
+def test_the_time_of_auto_exposure_is_written_and_read_back(frames, tmp_path):
+    """The manifest of a run repeats its pictures, and all that states the time is changed."""
+    control = {"delay": 1, "smoothing": 1.0, "iso_max": 800.0, "time_max": 0.02}
+    options = {"control": control, "shutter": {**BANDED, "exposure_time": 0.01}, **LOOPS}
+    options |= {"dark_current": {"exposure_time": 0.01}, "iso": 200}
+    run(tmp_path, "out", sequence=True, **options)
+    times = set()
+    for path in sorted((tmp_path / "out/a").glob("*.json")):
+        steps, sidecar = chain_of(path), json.loads(path.read_text())
+        found = {steps[name]["parameters"]["exposure_time"] for name in ("shutter", "dark_current")}
+        found |= {sidecar["camera_info"]["exposure_time"]}
+        assert max(found) == pytest.approx(min(found), rel=1e-6), found
+        times |= found
+    assert len(times) > 3
+    del options["control"]
+    list(clpipe.run(tmp_path / "out/run.csv", tmp_path / "again", device="numpy", **options))
+    assert pictures(tmp_path / "again") == pictures(tmp_path / "out")
+
+
+def test_rows_of_sub_frames_follow_the_time_of_auto_exposure():
+    lights = [np.full((16, 16, 3), level, np.float32) for level in (0.01, 0.03, 0.06)]
+    options = {"exposure": {"method": "auto"}, "device": "numpy", "iso": 100}
+    options |= {"stages": ["shutter", "exposure", "gamma"], "until": "exposure"}
+    shutter = {"subframes": 3, "line_time": 1e-3, "exposure_time": 0.004}
+    with clpipe.Stream(control={"time_max": 0.03}, shutter=shutter, **options) as stream:
+        shot = stream(lights)
+    own = Rows(**{**shutter, "exposure_time": shot.camera.exposure_time})
+    rows = weights_of(own, 3, 16, NO_MARGINS).T @ [0.01, 0.03, 0.06]
+    expected = rows * 2 ** (shot.settings["exposure"]["ev"] - 1)
+    assert shot.camera.exposure_time > 0.0055
+    assert shot.image[:, 8, 1] == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_drift_is_uniform_and_slow():
@@ -126,7 +222,8 @@ def test_the_documented_defaults_of_the_loops_are_those_of_the_code():
     table = page[page.index("| parameter |") : page.index("loops.toml")]
     rows = dict(re.findall(r"^\| `(\w+)` \| .* \| ([^|]+) \|$", table, re.MULTILINE))
     defaults = {name: field.default for name, field in Control.model_fields.items()}
-    in_words = {"iso_max": "none", "iso_min": "the ISO that is set"}
+    in_words = {"iso_max": "none", "iso_min": "the ISO that is set", "mains": "none"}
+    in_words["time_max"] = "the time that is set"
     assert rows == {
         name: in_words[name] if default is None else f"{default:g}"
         for name, default in defaults.items()

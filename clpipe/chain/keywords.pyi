@@ -142,7 +142,7 @@ class Exposure(TypedDict, total=False):
     method: Draw | Literal["gain", "auto", "photometric", "radiometric"]
     ev: Number
     headroom: Number
-    iso_ev: Number
+    sets_time: Flag
     rule: Draw | Literal["log_average", "percentile"]
     target: Number
     metering: Draw | Literal["average", "centre_weighted", "spot"]
@@ -428,6 +428,8 @@ class Control(TypedDict, total=False):
     hysteresis: Number
     iso_max: Number
     iso_min: Number
+    time_max: Number
+    mains: Number
 
 class Keywords(TypedDict, total=False):
     camera: Text

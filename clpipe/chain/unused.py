@@ -72,6 +72,10 @@ def _of_sequences(settings: Settings, chain: Chain, images: ImageFacts) -> Itera
             if issubclass(method, loops)
         ]
         yield f"no loop uses {own}; add {', or '.join(methods)}, or remove it"
+    if images.rate:
+        yield from _longer_than_a_frame(
+            f"{CONTROL}.time_max", settings.control.time_max, images.rate
+        )
     for key, draw in settings.draws.items():
         if isinstance(draw, Drift) and not images.is_sequence:
             yield f"{key} drifts only through the frames of a sequence; {images.remedy}"
@@ -96,9 +100,15 @@ def _of_shutter(settings: Settings, chain: Chain, images: ImageFacts) -> Iterato
             f"{listed} changes no pixel, because each picture has one render and the light is "
             f"steady; set {shutter.name}.subframes or {shutter.name}.flicker_depth as well"
         )
-    time = shutter.method.exposure_time or 0.0
-    if images.rate and "exposure_time" in given and time * images.rate > 1:
+    if images.rate and "exposure_time" in given:
+        yield from _longer_than_a_frame(
+            f"{shutter.name}.exposure_time", shutter.method.exposure_time, images.rate
+        )
+
+
+def _longer_than_a_frame(key: str, time: float | None, rate: Fraction) -> Iterator[str]:
+    if time and time * rate > 1:
         yield (
-            f"{shutter.name}.exposure_time is {time:g} s, but at {float(images.rate):g} frames per "
-            f"second a frame has {float(1 / images.rate):.4g} s; correct it, or --fps"
+            f"{key} is {time:g} s, but at {float(rate):g} frames per second a frame has "
+            f"{float(1 / rate):.4g} s; correct it, or --fps"
         )

@@ -17,9 +17,11 @@ import numpy as np
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.files import write_new
 from clpipe.base.types import Array
-from clpipe.camera.control import AutoIso, ControlLoop
+from clpipe.camera.control import AutoExposure, ControlLoop
+from clpipe.camera.optics import DEFAULT_EXPOSURE_TIME
 from clpipe.chain.chain import Chain, Step
 from clpipe.chain.identity import noise_key
+from clpipe.chain.keys import RENDER
 from clpipe.chain.photometry import METERED
 from clpipe.engine.extents import Box
 from clpipe.engine.options import RunOptions
@@ -38,6 +40,8 @@ CORNER = Box(0, 0, 1, 1)
 GAINS = ("red_gain", "blue_gain")  # what estimated white balance estimates
 
 DIGITS = 4  # decimal places of an EV and of a gain
+
+TIME = "exposure_time"
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class Meter:
         self._develop = develop
         # Each loop, and the place of the last frame that it followed.
         self._loops: dict[str, tuple[ControlLoop, float]] = {}
-        self._iso: AutoIso | None = None
+        self._exposure: AutoExposure | None = None
 
     def read(
         self,
@@ -132,13 +136,24 @@ class Meter:
                 metered.clear()
             is_lit = bool(metered)
             ev = round(follow(exposure.name, metered.get(METERED)) + method.ev, DIGITS) + 0.0
+            if is_lit:
+                self._exposure = self._exposure or AutoExposure(chain.camera.iso_range, control)
+            program = None
+            time = chain.optics.exposure_time
+            if self._exposure:
+                program = self._exposure.next(ev, chain.iso, time or DEFAULT_EXPOSURE_TIME)
+                ev = round(program.ev, DIGITS) + 0.0
             values[exposure.name] = {"method": "gain", "ev": ev}
             if method.headroom != Auto.model_fields["headroom"].default:
                 values[exposure.name]["headroom"] = method.headroom
-            if control.iso_max is not None and (is_lit or self._iso):
-                self._iso = self._iso or AutoIso(chain.iso, chain.camera.iso_range, control)
-                values["iso"] = round(self._iso.next(ev), DIGITS)
-                values[exposure.name]["iso_ev"] = round(self._iso.gain, DIGITS)
+            if program and control.iso_max is not None:
+                values["iso"] = round(program.iso, DIGITS)
+            if program and (time or control.time_max or control.mains):
+                values[exposure.name]["sets_time"] = False
+                # All places that state the time must agree.
+                steps = (step.name for step in chain.steps)
+                for table in (RENDER, *(n for n in steps if TIME in chain.settings.table(n))):
+                    values[table] = {TIME: float(f"{program.time:.9g}")}
         else:
             is_lit = bool(np.any(image))
         if balance:

@@ -70,15 +70,12 @@ class Gain(Exposing):
     summary: ClassVar = "multiply linear light by 2^(ev - headroom)"
     example: ClassVar = {"ev": 0.7}
 
-    iso_ev: float = parameter(
-        0.0,
-        "Part of ev that the ISO supplies, such as by auto ISO. It does not change the exposure "
-        "time.",
-        "EV",
-        ge=-20,
-        le=20,
+    sets_time: bool = parameter(
+        True,
+        "Whether ev changes the exposure time as well. If not, the stated time is already that of "
+        "the picture, such as the one that auto exposure sets.",
     )
 
     def time(self, exposure_time: float | None) -> float | None:
-        """The exposure time, s: EVs change it, but not those of the ISO."""
-        return exposure_time and exposure_time * 2.0 ** (self.ev - self.iso_ev)
+        """The exposure time, s, which EVs change, unless it is already that of the picture."""
+        return super().time(exposure_time) if self.sets_time else exposure_time
