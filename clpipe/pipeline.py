@@ -12,10 +12,11 @@ from xxhash import xxh3_64_hexdigest
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts, unknown_name
-from clpipe.base.types import Array, plain
+from clpipe.base.types import Array
 from clpipe.base.user_warnings import warn
 from clpipe.base.validation import check_argument_types
 from clpipe.chain.chain import Chain
+from clpipe.chain.drawing import plain_settings
 from clpipe.chain.entering import prepare_image
 from clpipe.chain.files import load_settings
 from clpipe.chain.identity import image_key, noise_key
@@ -109,7 +110,7 @@ class Pipeline(ReadOnly):
         **settings: "Unpack[Keywords]",
     ) -> None:
         self._settings = overlay(
-            load_settings(*as_texts(config)), resolve_paths(None, plain(settings))
+            load_settings(*as_texts(config)), resolve_paths(None, plain_settings(settings))
         )
         self._chain_range = start_at, until
         self._keep = tuple(as_texts(keep))
@@ -349,7 +350,7 @@ class Pipeline(ReadOnly):
             self.device.check_process()
         own = self._settings
         if settings:
-            own = overlay(own, resolve_paths(None, plain(settings)))
+            own = overlay(own, resolve_paths(None, plain_settings(settings)))
         return self._chain(own.drawn(key)) if settings or own.draws else self.chain
 
     def process_many(

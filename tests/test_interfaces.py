@@ -27,7 +27,7 @@ REQUESTS = [
     ({"output": "memory://b"}, "add webdataset=N", "add --webdataset N"),
     ({"codec": "h264"}, "codec: this option needs a clip; use output='NAME.mp4'", "--codec: this"),
     ({"augment": True}, "patch=clpipe.Patches(64, augment=True)", "add --patch SIZE"),
-    ({"iso": (100, 100)}, "iso: found [100, 100], which lists 100", "--iso: found '100,100'"),
+    ({"iso": [100, 100]}, "iso: found [100, 100], which lists 100", "--iso: found '100,100'"),
     ({"poses": "none.json"}, "poses none.json", "none.json"),
     ({"shard": "3/2"}, "shard: found '3/2'", "--shard: found '3/2'"),
     ({"until": "mosaic", "start_at": "gamma"}, "exchange start_at and until", "--start-at and"),
@@ -134,7 +134,7 @@ def test_an_archive_is_named_as_a_url(files, clpipe):
 @pytest.mark.parametrize(
     ("settings", "draw"),
     [
-        ({"iso": (100, 6400)}, "iso={'log_uniform': [100, 6400]}"),
+        ({"iso": [100, 6400]}, "iso={'log_uniform': [100, 6400]}"),
         ({"iso": [100, 800, 3200]}, "iso={'choice': [100, 800, 3200]}"),
         ({"camera": ["sony-a7r2", "canon-6d"]}, "camera={'choice': ['sony-a7r2', 'canon-6d']}"),
     ],

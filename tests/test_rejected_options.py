@@ -42,7 +42,13 @@ COMMANDS = """
 --set output.date=today => output.date: found 'today': write the date like 2026
 --set render.focal_length=0 => render.focal_length: found 0: .. greater than 0
 --set render.exposure_time=fast => render.exposure_time: found 'fast': .. number
---iso random => write iso = {log_uniform = [100, 6400]} in a configuration
+--iso random => or a range from which the ISO of each image is drawn, such as 100..6400
+--iso 100-6400 => or a range from which the ISO of each image is drawn, such as 100..6400
+--iso 100..x => iso: found '100..x'; expected the two ends of a range of random ISOs
+--iso 6400..100 => iso: log_uniform: found [6400, 100]; put the lower end first
+--iso 100..1e7 => found 1e+07, but camera sony-a7r2 goes from 100 to 25600
+--repeat 2 --sequence => --repeat: the frames of a sequence are not repeated
+--repeat 0 => --repeat
 --iso 100,x => --iso: found '100,x'; expected numbers above 0
 --iso 100,-5 => expected numbers above 0 with commas between them, such as 100,800,3200
 --iso 100,1e2 => --iso: found '100,1e2', which lists 100 twice; list it once

@@ -9,7 +9,6 @@ from typing import Any
 from clpipe.base.errors import RequestError
 from clpipe.base.memory import parse_size
 from clpipe.base.text import as_texts
-from clpipe.base.types import plain
 from clpipe.base.url_text import local_path
 from clpipe.base.urls import path_of
 from clpipe.base.validation import check_argument_types
@@ -17,6 +16,7 @@ from clpipe.batch.clips import parse_bit_rate, parse_rate, take_clip_options
 from clpipe.batch.execution import ExecutionOptions, parse_failures
 from clpipe.batch.images import Images
 from clpipe.batch.session import Run
+from clpipe.chain.drawing import plain_settings
 from clpipe.chain.formats import format_named
 from clpipe.chain.options import (
     DEFAULT_PATCHES,
@@ -64,7 +64,7 @@ def run(
     config: Texts | None = None,
     *,
     camera: Texts | Mapping[str, Any] | None = None,
-    iso: float | Sequence[float] | Mapping[str, Any] | None = None,
+    iso: float | str | Sequence[float] | Mapping[str, Any] | None = None,
     start_at: str | None = None,
     until: str | None = None,
     stage_files: Texts | None = None,
@@ -86,6 +86,7 @@ def run(
     patch: int | Patches | None = None,
     exclude: Texts | None = None,
     poses: str | Path | None = None,
+    repeat: int | None = None,
     layer: str | None = None,
     transfer: Transfer | None = None,
     max_pixels: int | None = None,
@@ -133,7 +134,8 @@ def run(
         camera: a built-in camera, by name or model, or a profile (.toml). With several, each
             camera's pictures go to OUT/CAMERA. None is sony-a7r2.
         iso: the ISO. Noise and denoising depend on it. With several, each ISO's pictures go to a
-            directory such as OUT/iso800. None is 100.
+            directory such as OUT/iso800. 100..6400 draws one for each image, and every octave of
+            the range is equally likely; in Python, (100, 6400) does the same. None is 100.
         start_at: the first stage to run. Inputs are then images of the kind that it reads, such as
             kept images or mosaics.
         until: the last stage to run.
@@ -189,6 +191,8 @@ def run(
             transforms.json (NeRF, nerfstudio), or a directory with COLMAP's text model. The cameras
             and poses of the pictures are written to OUT/cameras.json, OUT/transforms.json and
             OUT/sparse/0, see clpipe poses.
+        repeat: the number of pictures of each image, with their own noise and draws. They are
+            called OUT/NAME_0000.jpg and so on.
         layer: the layer or part of an EXR that is the picture.
         transfer: the transfer curve of renders with integer samples (PNG, TIFF and others). The
             choices are "srgb", "linear".
@@ -258,10 +262,10 @@ def run_of(
     set_options = {name: value for name, value in options.items() if value is not None}
     if not str(set_options["output"]):
         raise RequestError("output: found an empty path; name a directory")
-    series_options = {
+    series_options: dict[str, Any] = {
         name: set_options.pop(name) for name in ("camera", "iso") if name in set_options
     }
-    series, values = split_series(plain({**settings, **series_options}))
+    series, values = split_series(plain_settings({**settings, **series_options}))
     for name, value in set_options.items():
         converted = as_texts(value) if OPTIONS[name].type_ is list else value
         set_options[name] = CONVERTERS[name](converted) if name in CONVERTERS else converted

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from clpipe.base.errors import RequestError
@@ -29,6 +29,8 @@ class Images:
         series: several cameras and ISOs, whose pictures go to directories of their own.
         shard: the part of the images to make.
         per_tar: the number of images per tar. None writes no tars.
+        repeat: the number of pictures of each image, each with its own noise and draws. None is
+            one picture, with the name of the image.
         sequence: whether the images are frames of sequences.
         clips: the clips that the frames of sequences go into. None writes no clips.
         known_jobs: jobs that are known already, instead of inputs.
@@ -37,6 +39,7 @@ class Images:
     inputs: Sequence[str] = ()
     exclude: Sequence[str] = ()
     poses: Path | None = None
+    repeat: int | None = None
     series: Series = field(default_factory=Series)
     shard: Shard = field(default_factory=Shard)
     per_tar: int | None = None
@@ -67,6 +70,13 @@ class Images:
             known_jobs = find_jobs(self.inputs, output, loader.endings(), self.exclude)
             jobs = loader.exposures(known_jobs, self.sequence)
         jobs = assign_views(jobs, self.poses, loader.settings.render, loader.request.truth_at)
+        if self.repeat:
+            if self.sequence:
+                raise RequestError(
+                    "--repeat: the frames of a sequence are not repeated; run the sequence with "
+                    "another --seed and output directory instead"
+                )
+            jobs = [repetition(job, number) for job in jobs for number in range(self.repeat)]
         jobs = self.series.jobs(jobs, loader.settings)
         if self.sequence:
             if self.per_tar and self.shard.of > 1:
@@ -84,3 +94,15 @@ class Images:
             tars = self.shard.select(split_into_tars(jobs, self.per_tar, output))
             return [job for tar in tars for job in tar.jobs], tars
         return self.shard.select(jobs), []
+
+
+def repetition(job: Job, number: int) -> Job:
+    """Return a job for one of several pictures of an image. Its noise and draws are its own.
+
+    >>> again = repetition(Job(Path("in/a.exr"), "a.exr"), 3)
+    >>> again.key, again.stem
+    ('a_0003.exr', 'a_0003')
+    """
+    key = Path(job.key)
+    name = f"{job.name}_{number:04}" if job.name else ""
+    return replace(job, key=key.with_stem(f"{key.stem}_{number:04}").as_posix(), name=name)

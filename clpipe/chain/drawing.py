@@ -9,6 +9,7 @@ from itertools import product
 from typing import Any
 
 from clpipe.base.text import unknown_name
+from clpipe.base.types import plain
 from clpipe.chain.draws import Choice, Draw, Drift, parse_draw
 from clpipe.chain.keys import KEYS, setting_error
 from clpipe.chain.lens_presets import PRESETS
@@ -42,6 +43,37 @@ def parse_drawn(key: str, table: Mapping[str, Any]) -> Draw:
             "use {choice = ['A', 'B']}"
         )
     return draw
+
+
+def with_iso_range(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings whose ISO is a draw if it is a range: a text, or a tuple of two numbers.
+
+    >>> with_iso_range({"iso": "100..6400"}) == with_iso_range({"iso": (100, 6400)})
+    True
+    >>> with_iso_range({"iso": "100..6400"})
+    {'iso': {'log_uniform': [100.0, 6400.0]}}
+
+    Raises:
+        KeyedError: a range has no two numbers.
+    """
+    found = values.get("iso")
+    ends = tuple(found.split("..")) if isinstance(found, str) and ".." in found else found
+    if not isinstance(ends, tuple):
+        return dict(values)
+    try:
+        low, high = map(float, ends)
+    except ValueError:
+        raise setting_error(
+            f"iso: found {found!r}; expected the two ends of a range of random ISOs, such as "
+            "'100..6400' or (100, 6400); for a series, use a list"
+        ) from None
+    return {**values, "iso": {"log_uniform": [low, high]}}
+
+
+def plain_settings(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings from Python as those of a configuration file: plain values, ISO ranges."""
+    found: dict[str, Any] = plain(with_iso_range(values))
+    return found
 
 
 def draw_order(draws: Mapping[str, Draw], constants: Mapping[str, Any]) -> list[str]:

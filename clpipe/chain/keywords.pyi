@@ -433,7 +433,7 @@ class Control(TypedDict, total=False):
 
 class Keywords(TypedDict, total=False):
     camera: Text
-    iso: Number
+    iso: Number | Text | tuple[float, float]
     lens: Text
     focal_length: Number
     aperture: Number

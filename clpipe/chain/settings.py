@@ -17,7 +17,13 @@ from clpipe.base.text import quote_alternatives, unknown_name
 from clpipe.base.tracing import with_changes
 from clpipe.camera.control import Control
 from clpipe.camera.profile import Camera, built_in_name, load_camera
-from clpipe.chain.drawing import draw_extremes, draw_values, examples_of, parse_drawn
+from clpipe.chain.drawing import (
+    draw_extremes,
+    draw_values,
+    examples_of,
+    parse_drawn,
+    with_iso_range,
+)
 from clpipe.chain.draws import Choice, Draw
 from clpipe.chain.keys import (
     CODE,
@@ -279,7 +285,7 @@ def overlay(settings: Settings, values: Mapping[str, Any], folder: Path | None =
         values = resolve_paths(folder, values)
     if "lens" in values and settings.lens in PRESETS:
         settings = _without_lens(settings)
-    values = with_preset(values, settings.stages)
+    values = with_iso_range(with_preset(values, settings.stages))
     tables = {key: value for key, value in values.items() if isinstance(value, Mapping)}
     plain = {k: v for k, v in values.items() if k not in tables}
     plain = _check_plain_values(settings, plain)

@@ -12,9 +12,9 @@ from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.processors import available_processors
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
-from clpipe.base.types import plain
 from clpipe.base.user_warnings import warn
 from clpipe.base.validation import check_argument_types
+from clpipe.chain.drawing import plain_settings
 from clpipe.chain.python_words import errors_in_python, python_words
 from clpipe.chain.rendition import DEVELOPMENT
 from clpipe.chain.request import Request
@@ -161,7 +161,7 @@ class Dataset(ReadOnly):
         self._patches = Patches(patch) if isinstance(patch, int) else patch
         request = Request.from_options(
             config=config,
-            values=plain(settings),
+            values=plain_settings(settings),
             start_at=start_at,
             until=until,
             layer=layer,

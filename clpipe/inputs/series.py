@@ -9,6 +9,7 @@ from typing import Any
 from clpipe.base.errors import RequestError
 from clpipe.base.text import as_texts
 from clpipe.camera.profile import load_camera
+from clpipe.chain.drawing import with_iso_range
 from clpipe.chain.isos import check_cameras
 from clpipe.chain.settings import Settings, overlay
 from clpipe.inputs.jobs import Job
@@ -117,6 +118,7 @@ def split_series(
     Raises:
         RequestError: an ISO is not a number above 0, or occurs twice.
     """
+    settings = with_iso_range(settings)
     series_values = {
         key: settings[key]
         for key in ("camera", "iso")
@@ -145,8 +147,7 @@ def check_isos(isos: float | str | Sequence[float]) -> tuple[float, ...]:
     if not all(math.isfinite(iso) and iso > 0 for iso in numbers):
         raise RequestError(
             f"--iso: found {found}; expected numbers above 0 with commas between them, such as "
-            "100,800,3200. For a random ISO of each image, write iso = {log_uniform = [100, 6400]} "
-            "in a configuration, and pass it with -c"
+            "100,800,3200, or a range from which the ISO of each image is drawn, such as 100..6400"
         )
     names = [f"{iso:g}" for iso in numbers]
     for name in names:

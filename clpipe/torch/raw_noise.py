@@ -14,10 +14,10 @@ from clpipe.base.cache import BoundedCache
 from clpipe.base.errors import ImageError, RequestError
 from clpipe.base.readonly import ReadOnly
 from clpipe.base.text import as_texts
-from clpipe.base.types import plain
 from clpipe.base.validation import check_argument_types
 from clpipe.base.workers import Place, seed_at
 from clpipe.chain.chain import Chain
+from clpipe.chain.drawing import plain_settings
 from clpipe.chain.files import load_settings
 from clpipe.chain.making import make_chain
 from clpipe.chain.paths import resolve_paths
@@ -81,7 +81,7 @@ class RawNoise(ReadOnly, nn.Module):
         camera_value = camera if isinstance(camera, Mapping) else str(camera)
         values = {**settings, "camera": camera_value, "iso": iso, "seed": seed or 0}
         super().__init__()
-        values = resolve_paths(None, plain(values))
+        values = resolve_paths(None, plain_settings(values))
         self._settings = overlay(load_settings(*as_texts(config)), values)
         self._seed = seed
         self._place = Place()

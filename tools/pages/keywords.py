@@ -81,6 +81,7 @@ def text_of() -> str:
         parts.append(class_of(tables[name], fields_of(model)))
     kinds = {int: "Whole", str: "Text", float: "Number", list: "Sequence[str]"}
     plain = {name: {kinds[key.type_]} for name, key in KEYS.items() if name != CODE}
+    plain["iso"] |= {"Text", "tuple[float, float]"}  # a range, such as "100..6400"
     fields = plain | {name: {title} for name, title in tables.items()}
     parts.append(class_of("Keywords", fields))
     command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", str(PATH), "-"]
