@@ -1,4 +1,5 @@
 import itertools
+import json
 import os
 import resource
 import shutil
@@ -32,6 +33,7 @@ from clpipe.engine.runner import Result, Runner
 from clpipe.images.write import write_exr as write_file
 from clpipe.inputs.find import Job, find_jobs
 from clpipe.inputs.loader import ImageLoader
+from clpipe.outputs.shared import with_shared
 from clpipe.outputs.sidecar import DIGEST_KEY, sidecar_bytes
 from clpipe.outputs.writer import OutputWriter
 from clpipe.stage import Kind
@@ -53,9 +55,14 @@ WRITTEN = "2026:01:01 00:00:00"
 
 
 def written(folder: Path) -> list[str]:
-    """Return the files below a folder, sorted, without the run's log."""
-    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-    return sorted(files - {"run.jsonl"})
+    """Return the files below a folder, sorted, without the run's log and shared values."""
+    found = (p for p in folder.rglob("*") if p.is_file() and p.suffix != ".run")
+    return sorted({p.relative_to(folder).as_posix() for p in found} - {"run.jsonl"})
+
+
+def values_of(sidecar: str | Path) -> dict[str, Any]:
+    """Return all values of a sidecar, with those that its run shares."""
+    return with_shared(json.loads(Path(sidecar).read_text()), Path(sidecar).parent)
 
 
 def contents(folder: str | Path) -> dict[str, bytes]:

@@ -38,7 +38,7 @@ from clpipe.outputs import folder as output_folders
 from clpipe.outputs import record
 from clpipe.outputs.folder import LOCK, output_folder, remove_unfinished
 from clpipe.outputs.writer import OutputWriter
-from tests.conftest import ROOT, contents, reseal, stamps, statuses, worker_of, written
+from tests.conftest import ROOT, contents, reseal, stamps, statuses, values_of, worker_of, written
 from tests.held import (
     GO,
     GUARD,
@@ -591,6 +591,9 @@ def test_a_replay_with_other_bytes_says_what_was_different(clpipe, renders):
     sidecar_ = Path("out/r000.json")
     record = json.loads(sidecar_.read_text())
     record["outputs"][0]["sha256"] = "0" * 64
+
+    record = {**values_of(sidecar_), "outputs": record["outputs"]}
+    del record["run"]  # what it shares is in the sidecar itself
 
     def differs(**changes):
         reseal(sidecar_, {**record, **changes})

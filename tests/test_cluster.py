@@ -68,9 +68,9 @@ def renders(write_exr):
 
 
 def contents(folder):
-    """Return the bytes of all files except logs."""
+    """Return the bytes of all files except logs and shared values."""
     found = {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
-    return {path: data for path, data in found.items() if path.suffix != ".jsonl"}
+    return {path: data for path, data in found.items() if path.suffix not in (".jsonl", ".run")}
 
 
 def log(folder):

@@ -102,7 +102,7 @@ def test_a_working_directory_that_has_gone(tmp_path):
 def test_a_replay_that_cannot_be_names_its_sidecar(clpipe, write_exr):
     clpipe("run", write_exr("a.exr", np.full((4, 6, 3), 0.25)), "-o", "out", "--device", "numpy")
     values = json.loads(Path("out/a.json").read_text())
-    values["request"]["options"]["camera"] = "/dev/zero"
+    values["request"]["options"] = {"camera": "/dev/zero"}
     reseal(Path("out/a.json"), values)
     result = clpipe("replay", "out/a.json", "-o", "b", "--device", "numpy", status=2)
     assert result.stderr.startswith("clpipe: out/a.json: unknown camera '/dev/zero'")

@@ -14,6 +14,7 @@ from PIL import Image
 from clpipe.images.exif_block import with_lens_model
 from clpipe.images.tags import Tags
 from clpipe.images.write import write_display
+from tests.conftest import values_of
 
 RUN = ("--device", "numpy", "--skip", "noise", "--format", "png", "--format", "exr")
 PHOTOMETRIC = ("--set", "exposure.method=photometric", "--set", "exposure.scale=400")
@@ -34,7 +35,7 @@ def exif(path):
 
 
 def photometry_of(path):
-    return json.loads(Path(path).read_text())["photometry"]
+    return values_of(path)["photometry"]
 
 
 def light(folder, name):

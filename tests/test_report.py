@@ -15,6 +15,7 @@ from PIL import Image
 
 from clpipe.chain.rendition import DEFAULT_RENDITION
 from clpipe.images.write import write_exr as write
+from clpipe.outputs.record import whole_step
 from clpipe.reports.figures import last_failures, sessions
 from clpipe.reports.images import Budget, compared_image, places_of
 from clpipe.reports.run import read_run
@@ -437,7 +438,7 @@ def test_a_run_is_read_from_its_sidecars(out):
     assert steps[0]["exposure"] != steps[1]["exposure"]
     sidecar = out / "a.json"
     whole = json.loads(sidecar.read_text())
-    assert list(steps[1].values()) == whole["stages"]
+    assert list(steps[1].values()) == [*map(whole_step, whole["stages"])]
     reseal(sidecar, {**whole, "stages": tuple(whole["stages"])})  # in one line
     again = next(made for made in read_run(out).pictures if made.name == "a")
     assert again.record == run.of_image("a")[DEFAULT_RENDITION].record

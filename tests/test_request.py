@@ -89,8 +89,11 @@ def test_records_are_equal_where_the_bytes_of_a_picture_are(change):
 def test_a_damaged_record(damage):
     with pytest.raises(RequestError, match=r"formats|damaged"):
         Request.from_record({**Request().record(), **damage})
-    with pytest.raises(RequestError, match="damaged: config is missing"):
-        Request.from_record({})
+
+
+def test_a_record_has_no_default_values():
+    assert Request().record() == {"files": {}}
+    assert Request.from_record({}) == Request()
 
 
 def test_outputs_that_are_left_open_follow_from_the_chain():
@@ -144,7 +147,7 @@ def test_no_code_comes_from_a_sidecar(clpipe, write_exr, forget_stage_files):
         {"files": {}},
         {"stage_files": []},
         {"files": {}, "config": named},
-        {"files": {}, "options": {**request["options"], **named}},
+        {"files": {}, "options": named},
         {"files": {}, "image": named},
     ):
         forget()

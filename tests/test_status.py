@@ -132,7 +132,7 @@ def test_the_log_is_in_the_bucket_while_the_run_goes_on(bucket, clpipe, monkeypa
     clpipe("run", "in", "-o", "bucket://b/set", *TARS)
     names = [name for name, _ in Bucket.uploads]
     assert names[0].endswith(".jsonl") and json.loads(Bucket.uploads[0][1])["event"] == "start"
-    assert names.index("000002.tar") > 3 and len(set(names)) == 7
+    assert names.index("000002.tar") > 3 and len(set(names)) == 8
     logs = [data.count(b"\n") for name, data in Bucket.uploads if name == names[0]]
     assert logs == [1, *range(2, 8), 8]
     text = clpipe("status", "bucket://b/set").stdout

@@ -27,6 +27,7 @@ from clpipe.batch.tars import NUMBERED, Tar
 from clpipe.inputs.find import Job
 from clpipe.outputs.existing import Redo
 from clpipe.outputs.program import program_digest
+from clpipe.outputs.shared import SHARED
 from clpipe.outputs.writer import OutputWriter
 
 INDEX = ".index.json"
@@ -129,6 +130,10 @@ class RemoteTars(Tars):
         url = url_of(tar.path)
         assert url
         upload(tar.path, url)
+        for path in sorted(tar.folder.glob(f"*.{SHARED}")):
+            if path.name not in self.names:
+                upload(path, f"{url_of(tar.folder)}/{path.name}")
+                self.names.add(path.name)
         counts = Counter(statuses.values())
         self._write(tar, {"size": size, "sha256": digest, "failed": failed, "counts": counts})
         discard(tar.path)

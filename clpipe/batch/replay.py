@@ -17,6 +17,7 @@ from clpipe.chain.request import Request
 from clpipe.inputs.find import Job
 from clpipe.inputs.manifest import check_output_name
 from clpipe.outputs.record import PLACE
+from clpipe.outputs.shared import with_shared
 from clpipe.outputs.sidecar import SidecarError, input_entries, output_entries, read_sidecar
 
 CODE = (".py", ".cl")  # extensions of code files
@@ -51,7 +52,7 @@ class Replay:
             values = read_sidecar(sidecar)
         except FileNotFoundError:
             raise ImageError(f"{sidecar}: this sidecar no longer exists") from None
-        digests, current = digests_in(values), environment_in(values)
+        digests, current = digests_in(values), environment_in(values, sidecar.parent)
         differing = sorted(
             n for n in {*self.outputs, *digests} if self.outputs.get(n) != digests.get(n)
         )
@@ -76,14 +77,18 @@ def shorten(value: str) -> str:
     return value[:12] if re.fullmatch("[0-9a-f]{64}", value) else value
 
 
-def environment_in(values: Mapping[str, Any]) -> dict[str, str]:
+def environment_in(values: Mapping[str, Any], folder: Path) -> dict[str, str]:
     """Return what a picture's bytes depend on besides the request, by name, from a sidecar.
+
+    Without the file of its run, only the program is known.
 
     Raises:
         KeyError, TypeError, AttributeError: they are damaged.
     """
-    versions = {name: str(version) for name, version in values["versions"].items()}
-    return {"program": str(values["program"]), **device_values(values["device"]), **versions}
+    whole = with_shared(values, folder)
+    versions = {name: str(version) for name, version in whole.get("versions", {}).items()}
+    device = device_values(whole.get("device", {}))
+    return {"program": str(values["program"]), **device, **versions}
 
 
 def device_values(device: Mapping[str, Any]) -> dict[str, str]:
@@ -118,7 +123,7 @@ def replay_of(
         raise RequestError(f"{path}: it has one input; found {len(inputs)}")
     values = _values(path)
     try:
-        replay = _replay(values, inputs, max_pixels)
+        replay = _replay(values, path.parent, inputs, max_pixels)
         files = {str(name): str(digest) for name, digest in values["request"]["files"].items()}
         inputs_of_job = input_entries(values, replay.job.paths)
         files |= {str(path): str(expected["sha256"]) for path, expected in inputs_of_job}
@@ -172,7 +177,9 @@ def _values(path: Path) -> Mapping[str, Any]:
     return values
 
 
-def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int | None) -> Replay:
+def _replay(
+    values: Mapping[str, Any], folder: Path, inputs: Sequence[Path], max_pixels: int | None
+) -> Replay:
     """Return the picture to recompute for the values of a sidecar.
 
     Raises:
@@ -202,7 +209,7 @@ def _replay(values: Mapping[str, Any], inputs: Sequence[Path], max_pixels: int |
         subframes=differing,
         is_panorama="panorama" in values,
     )
-    return Replay(request, job, environment_in(values), digests_in(values))
+    return Replay(request, job, environment_in(values, folder), digests_in(values))
 
 
 def _check_code(path: Path, code: Mapping[str, str], stage_files: Sequence[Path]) -> None:

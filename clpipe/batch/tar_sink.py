@@ -46,6 +46,10 @@ class StagedWriter(OutputWriter):
         """Return the name of a job's file before it is packed."""
         return f"{self.folder}/{self.folders[job.stem]}/{job.stem}{ending}"
 
+    def shared_folder(self, sidecar: Path) -> Path:
+        """Return the folder of what pictures share: that of the tars and clips."""
+        return self.folder
+
     def write(self, *arguments: Any) -> dict[Path, Stored]:
         """Write the images of one rendition. They go into the tar, so they need no fsync."""
         with unsynced_files():

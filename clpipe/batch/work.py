@@ -4,6 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 from clpipe.base.errors import ImageError, OutputError, RequestError
 from clpipe.base.files import FileGroup, deferred_files
@@ -28,8 +29,9 @@ from clpipe.inputs.find import Job
 from clpipe.inputs.loader import ImageLoader
 from clpipe.outputs.recipes import Recipe
 from clpipe.outputs.record import picture_record
+from clpipe.outputs.shared import share
 from clpipe.outputs.sidecar import SIDECAR, write_sidecar
-from clpipe.stage import Kind
+from clpipe.stage import Kind, StageRole
 
 
 class ImageWorker(JobLoader):
@@ -81,6 +83,16 @@ class ImageWorker(JobLoader):
         formats = (*writer.formats, *(["exr"] if writer.request.baselines else []))
         kinds = results, formats, writer.request.keep, extra_images, in_numpy
         return host_bytes(self.loader.claim(job), self.chain, *kinds)
+
+    def _shares_response(self, job: Job) -> bool:
+        """Return whether the pictures of a run have one response to greys, or a few."""
+        steps = {s.name for s in self.chain.steps if s.stage.role is StageRole.RESPONSE}
+        return not steps & {*self._drawn_steps, *job.values}
+
+    @cached_property
+    def _drawn_steps(self) -> set[str]:
+        """The steps whose parameters are drawn."""
+        return {key.partition(".")[0] for key in self.loader.request.settings().draws}
 
     def compile(self, device: Device | None) -> None:
         """Compile the kernels of the first chain for a device.
@@ -236,7 +248,7 @@ class ImageWorker(JobLoader):
             carried,
             state.patches,
         )
-        write_sidecar(path, record)
+        write_sidecar(path, share(record, writer.shared_folder(path), self._shares_response(job)))
         return [str(f.relative_to(writer.folder)) for f in (*files, path)]
 
 

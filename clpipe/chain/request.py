@@ -148,9 +148,6 @@ class Request(RecordedRequest):
         """
         damaged = "the request in this file is damaged: "
         known = {name: record[name] for name in RECORDED_FIELDS if name in record}
-        for name in RECORDED_FIELDS:
-            if name not in known and name != "truth_at":  # older sidecars lack it
-                raise RequestError(f"{damaged}{name} is missing")
         try:
             found = _record_adapter().validate_json(json.dumps(known), strict=True)
         except ValidationError as error:
@@ -244,15 +241,14 @@ class Request(RecordedRequest):
     def record(self) -> dict[str, Any]:
         """Return the request as a sidecar stores it, in JSON values.
 
-        It contains :data:`RECORDED_FIELDS`, and under "files" the SHA-256 of all files that are
-        named. Equal records of the same image produce the same bytes.
+        It contains the :data:`RECORDED_FIELDS` that have no default values, and under "files" the
+        SHA-256 of all files that are named. Equal records of the same image produce the same bytes.
 
         Raises:
             RequestError: as :meth:`settings`.
         """
-        return _through_json(
-            {**{name: getattr(self, name) for name in RECORDED_FIELDS}, "files": self._files()}
-        )
+        recorded = {name: getattr(self, name) for name in RECORDED_FIELDS}
+        return without_defaults(_through_json({**recorded, "files": self._files()}))
 
     def record_over(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """Return :meth:`record`, computed from the record of a request for another image.
@@ -261,7 +257,7 @@ class Request(RecordedRequest):
             RequestError: as :meth:`settings`.
         """
         changed = {"image": self.image, "image_name": self.image_name, "files": self._files()}
-        return {**record, **_through_json(changed)}
+        return without_defaults({**record, **_through_json(changed)})
 
     def _files(self) -> dict[str, str]:
         """Return the SHA-256 of all files that the request names, by name."""
@@ -279,6 +275,22 @@ class Request(RecordedRequest):
         if not self.options:
             return configured
         return self.settings_cache.get((config, options), lambda: overlay(configured, self.options))
+
+
+def without_defaults(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the record of a request in the order of its fields, without default values.
+
+    >>> without_defaults({"files": {}, "keep": [], "image_name": "a.exr"})
+    {'image_name': 'a.exr', 'files': {}}
+    """
+    kept = {k: record[k] for k in RECORDED_FIELDS if record.get(k, _DEFAULTS[k]) != _DEFAULTS[k]}
+    return {**kept, "files": record["files"]}
+
+
+_DEFAULTS = {
+    name: list(value) if isinstance(value, tuple) else value
+    for name, value in vars(RecordedRequest()).items()
+}
 
 
 @cache

@@ -125,7 +125,7 @@ def _pictures(
                 ),
             )
         return
-    side = values["request"]["patch"]
+    side = values["request"].get("patch")
     ending, rendition = extension_of(values["request"]["formats"][0]), Rendition.from_record(values)
     stem = Path(values["name"]).name
     for number, patch in enumerate(values["patches"]):

@@ -42,7 +42,8 @@ class Responses:
         """Return a picture's photometry, with its response as an index into the list of curves."""
         if picture.photometry is None:
             return {}
-        curve = picture.photometry["response"]
+        if (curve := picture.photometry.get("response")) is None:
+            return {"photometry": {**picture.photometry}}
         if curve not in self._curves:
             self._curves.append(curve)
         return {"photometry": {**picture.photometry, "response": self._curves.index(curve)}}

@@ -21,6 +21,7 @@ from clpipe.outputs.plan import OutputPlan, RenditionFiles
 from clpipe.outputs.program import program_digest
 from clpipe.outputs.sidecar import (
     SIDECAR,
+    NewerFormatError,
     SidecarError,
     input_entries,
     output_entries,
@@ -87,10 +88,12 @@ def find_existing(
         is_exclusive: whether only clpipe writes to this folder.
 
     Raises:
-        ImageError: a file of the same name exists that clpipe did not write.
+        ImageError: a file of the same name exists that clpipe did not write, or a newer one did.
     """
     try:
         values = read_sidecar(files.sidecar)
+    except NewerFormatError:
+        raise
     except (FileNotFoundError, SidecarError):
         values = {}
     listed = output_entries(values)

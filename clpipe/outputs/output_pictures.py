@@ -11,6 +11,7 @@ from clpipe.chain.formats import DNG, extension_of
 from clpipe.chain.render_camera import Matrix, Vector
 from clpipe.chain.rendition import BASELINES, NOISY, PICTURES, Rendition, Role
 from clpipe.outputs.carried import carried_files
+from clpipe.outputs.shared import RESPONSE, SHARED, shared_path, with_shared
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, output_entries, sidecar_files, values_at
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, PINHOLE, Intrinsics
 
@@ -65,7 +66,7 @@ def output_pictures(folder: Path, skipped: Mapping[str, list[str]]) -> Iterator[
     for path in sidecar_files(folder):
         shown = path.relative_to(folder).as_posix()
         try:
-            values = values_at(path)
+            values = with_shared(values_at(path) or {}, path.parent)
             role = values and Rendition.from_record(values).role
             file = values and picture_of(path, values) if role in MODEL_FOLDERS else None
             if not values or not role or not file:
@@ -80,6 +81,10 @@ def output_pictures(folder: Path, skipped: Mapping[str, list[str]]) -> Iterator[
             layers, files = values.get("carried", ()), carried_files(values)
             depths = [files.get(each["layer"]) for each in layers if each["kind"] == "depth"]
             depth = next((Path(shown).with_name(name).as_posix() for name in depths if name), "")
+            if values["photometry"] and RESPONSE not in values["photometry"]:
+                lost = shared_path(Path(), str(values.get(SHARED))).name
+                reason = f"in these files without its response to greys, because {lost} is missing"
+                skipped[reason].append(shown)
             remaining = *_photometry_and_motion(values), str(values["name"]), depth
             yield OutputPicture(shown, role, simplest_model(camera), pose_values, *remaining)
         except SidecarError:
@@ -100,7 +105,8 @@ def _photometry_and_motion(
     photometry = TABLE.validate_python(values["photometry"])
     motion = TABLE.validate_python(values.get("motion"))
     if photometry is not None:
-        TABLE.validate_python(photometry["response"])
+        float(photometry["gain"])
+        TABLE.validate_python(photometry.get(RESPONSE))
     if motion:
         for name in ("first_row", "last_row"):
             POSE.validate_python((motion[name]["R"], motion[name]["t"]))

@@ -18,7 +18,7 @@ from clpipe.chain.rendition import (
     VARIANCE,
     Rendition,
 )
-from clpipe.chain.request import ResolvedRequest
+from clpipe.chain.request import ResolvedRequest, without_defaults
 from clpipe.inputs.companions import CARRIED
 from clpipe.inputs.jobs import Job
 from clpipe.outputs.carried import png_suffix
@@ -125,8 +125,10 @@ class OutputPlan:
 
     def request_record(self, request: Mapping[str, Any], rendition: Rendition) -> dict[str, Any]:
         """Return the part of an image's request record that is about one rendition."""
-        record = {**request, "keep": list(self.kept_steps(rendition))}
-        return record if self.carries(rendition) else record | {"carry": []}
+        carry = list(self.request.carry) if self.carries(rendition) else []
+        return without_defaults(
+            {**request, "keep": list(self.kept_steps(rendition)), "carry": carry}
+        )
 
     def carries(self, rendition: Rendition) -> bool:
         """Return whether carried layers are written with a rendition: only with the first."""

@@ -11,7 +11,8 @@ from clpipe.base.files import Stored
 from clpipe.chain.camera_info import camera_info
 from clpipe.chain.chain import Chain
 from clpipe.chain.photometry import photometry_of
-from clpipe.chain.render_camera import POSE, SPECTRA
+from clpipe.chain.registry import all_stages
+from clpipe.chain.render_camera import POSE
 from clpipe.engine.device import Device
 from clpipe.engine.runner import Result
 from clpipe.engine.state import has_state
@@ -24,7 +25,7 @@ from clpipe.outputs.motion import motion_records, row_times
 from clpipe.outputs.patches import Patch, metadata_of
 from clpipe.outputs.program import all_versions, device_record, program_digest
 from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sidecar import VERSION_KEY, CachedJson, sidecar_bytes
+from clpipe.outputs.sidecar import FORMAT, FORMAT_KEY, VERSION_KEY, CachedJson, sidecar_bytes
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.stage import ImageLayer
 
@@ -107,6 +108,7 @@ def picture_record(
     intrinsics = intrinsics_of(chain, source)
     return {
         VERSION_KEY: __version__,
+        FORMAT_KEY: FORMAT,
         "input": job.input,
         "input_size": stamps[0][0],
         "input_modified": stamps[0][1],
@@ -127,9 +129,10 @@ def picture_record(
         "iso": chain.iso,
         **({PLACE: asdict(job.place)} if job.place and has_state(chain) else {}),
         **({"lens": lens.name} if (lens := chain.optics.calibration) else {}),
-        "output": chain.settings.output.model_dump()
-        | chain.settings.render.with_defaults(source.shot).model_dump(exclude=POSE | SPECTRA)
-        | chain.settings.render.model_dump(include=SPECTRA, exclude_defaults=True),
+        "output": chain.settings.output.model_dump(exclude_defaults=True)
+        | chain.settings.render.with_defaults(source.shot).model_dump(
+            exclude=POSE, exclude_defaults=True
+        ),
         "intrinsics": intrinsics.record() if intrinsics else None,
         "camera_info": camera_info(
             chain, result.estimates, source.pixels.shape[1::-1], intrinsics
@@ -181,6 +184,7 @@ def patch_text(values: Mapping[str, Any], number: int) -> bytes:
     return sidecar_bytes(
         {
             VERSION_KEY: values[VERSION_KEY],
+            FORMAT_KEY: values.get(FORMAT_KEY, 0),
             **repeated,
             **values[METADATA],
             **values[PATCHES][number],
@@ -188,15 +192,34 @@ def patch_text(values: Mapping[str, Any], number: int) -> bytes:
     )
 
 
+def whole_step(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry of a step in a sidecar with the default values that it lacks.
+
+    >>> whole_step({"name": "exposure", "method": "gain", "parameters": {"ev": 1.0}})["parameters"]
+    {'ev': 1.0, 'headroom': 1.0, 'sets_time': True}
+    """
+    stage = all_stages().get(str(record.get("stage", record.get("name"))))
+    methods = {each.method: each for each in stage.methods} if stage else {}
+    method, own = methods.get(str(record.get("method"))), record.get("parameters", {})
+    fields = method.model_fields if method and isinstance(own, dict) else {}
+    defaults = {name: each.default for name, each in fields.items()}
+    return {**record, "parameters": {**defaults, **own} if fields else own}
+
+
 @lru_cache(maxsize=8)
 def stage_records(chain: Chain) -> list[dict[str, Any]]:
-    """Return a sidecar's entry for the steps of a chain, as JSON values that images share."""
+    """Return a sidecar's entry for the steps of a chain, as JSON values that images share.
+
+    Parameters that have the default of their method are missing, and so is a stage's name if the
+    step has it.
+    """
     return [
         CachedJson(
             name=step.name,
-            stage=step.stage.name,
+            **({} if step.name == step.stage.name else {"stage": step.stage.name}),
             method=step.method.method,
-            parameters=step.method.model_dump(),
+            **({"parameters": own} if own else {}),
         )
         for step in chain.steps
+        for own in [step.method.model_dump(exclude_defaults=True)]
     ]

@@ -24,6 +24,9 @@ SIDECAR = "json"  # the extension of sidecars
 
 VERSION_KEY = "clpipe"  # the first key of every sidecar
 
+FORMAT_KEY = "format"  # the key with the number of a format
+FORMAT = 1  # the number of the formats of sidecars, logs, cameras.json and --json
+
 DIGEST_KEY = "sidecar_sha256"  # the last key: the SHA-256 of all lines before its own
 
 BEGINNING = b'{\n  "%b": ' % VERSION_KEY.encode()
@@ -45,6 +48,28 @@ class SidecarError(ImageError):
             "match), so it is not used. To restore it, repeat the same clpipe run. To change "
             "settings, use options or a configuration"
         )
+
+
+class NewerFormatError(SidecarError):
+    """A newer clpipe wrote a file, in a format that this one does not know."""
+
+    def __init__(self, name: Path | str, number: Any) -> None:
+        ImageError.__init__(
+            self,
+            f"{name}: a newer clpipe wrote this file: its format has number {number}, and this "
+            f"version knows {FORMAT}. Install the newer version, or use another output directory",
+        )
+
+
+def check_format(values: Mapping[str, Any], name: Path | str) -> None:
+    """Check that a file has a known format. Files from before the numbers have none, or 0.
+
+    Raises:
+        NewerFormatError: a newer version wrote it.
+    """
+    number = values.get(FORMAT_KEY, 0)
+    if not isinstance(number, int) or number > FORMAT:
+        raise NewerFormatError(name, number)
 
 
 def sidecar_bytes(record: Mapping[str, Any]) -> bytes:
@@ -70,7 +95,7 @@ def parse_sidecar(data: bytes, name: Path | str) -> dict[str, Any] | None:
         The values, or None if the file is empty or not a sidecar of clpipe.
 
     Raises:
-        SidecarError: it was edited, cut off or damaged.
+        SidecarError: it was edited, cut off or damaged, or a newer version wrote it.
     """
     end = data.rfind(b'  "%b": "' % DIGEST_KEY.encode())
     if end > 0 and data[end:] == _digest_lines(data[:end]):
@@ -81,6 +106,7 @@ def parse_sidecar(data: bytes, name: Path | str) -> dict[str, Any] | None:
         except ValueError:
             values = None
         if isinstance(values, dict) and VERSION_KEY in values:
+            check_format(values, name)
             return values
     if is_sidecar(data):
         raise SidecarError(name)

@@ -14,6 +14,8 @@ from clpipe.batch.run_log import read_log
 from clpipe.batch.tars import DAMAGED
 from clpipe.chain.keys import KEYS as SINGLE
 from clpipe.chain.rendition import Rendition
+from clpipe.outputs.record import whole_step
+from clpipe.outputs.shared import with_shared
 from clpipe.outputs.sidecar import SIDECAR, SidecarError, output_entries, parse_sidecar
 
 TAR = ".tar"
@@ -127,7 +129,10 @@ class Run:
         kept = {key: record.get(key) for key in KEYS}
         kept |= {key: shared(repr(record.get(key)), record.get(key)) for key in SHARED_KEYS}
         kept["asked"] = shared(repr(sorted(requested)), requested)
-        kept["stages"] = [shared(repr(step), step) for step in steps if isinstance(step, dict)]
+        dicts = {repr(step): step for step in steps if isinstance(step, dict)}
+        kept["stages"] = [
+            self._alike.get(text) or shared(text, whole_step(step)) for text, step in dicts.items()
+        ]
         return kept
 
     def add(self, picture: RunPicture) -> None:
@@ -208,7 +213,7 @@ def _in_folder(run: Run) -> Iterator[RunPicture]:
                     run.problems.append(f"{_joined(folder, name)}: cannot be read: {error}")
                     continue
                 siblings = siblings or _files(parent, folder)
-                yield from _read_picture(run, folder, name, data, siblings)
+                yield from _read_picture(run, folder, name, data, siblings, Path(parent))
 
 
 def _files(path: str, folder: str) -> dict[str, Blob]:
@@ -243,11 +248,11 @@ def _in_tar(run: Run, path: Path) -> Iterator[RunPicture]:
     except DAMAGED as error:
         run.problems.append(f"{label}: cannot be read to its end: {error}")
     for folder, name, data in sidecars:
-        yield from _read_picture(run, folder, name, data, siblings[folder])
+        yield from _read_picture(run, folder, name, data, siblings[folder], path.parent)
 
 
 def _read_picture(
-    run: Run, folder: str, name: str, data: bytes, siblings: Mapping[str, Blob]
+    run: Run, folder: str, name: str, data: bytes, siblings: Mapping[str, Blob], shared_folder: Path
 ) -> Iterator[RunPicture]:
     """Yield the picture of a sidecar, unless the sidecar is damaged or not from clpipe.
 
@@ -257,9 +262,11 @@ def _read_picture(
         name: the file name of the sidecar.
         data: its bytes.
         siblings: the files of the directory, by name.
+        shared_folder: the folder of the values that its run shares.
     """
     try:
         record = parse_sidecar(data, _joined(folder, name))
+        record = record and with_shared(record, shared_folder)
     except SidecarError as error:
         run.problems.append(str(error))
         return
