@@ -8,10 +8,12 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import OpenImageIO as oiio
 import pyopencl as cl
@@ -98,7 +100,43 @@ def run_cli(*arguments: object, status: int | tuple[int, ...] = 0) -> ClickResul
         raise result.exception
     allowed = status if isinstance(status, tuple) else (status,)
     assert result.exit_code in allowed, result.output
+    words = [str(a) for a in arguments]
+    if "--json" in words and result.stdout.startswith("{"):
+        is_import = words[:2] == ["cameras", "import"]
+        check_schema(f"command.{'.'.join(words[: 1 + is_import])}", json.loads(result.stdout))
+    if words[0] == "run" and "-o" in words and result.exit_code == 0:
+        check_files(Path(words[words.index("-o") + 1]))
     return result
+
+
+@cache
+def validator(name: str) -> jsonschema.protocols.Validator:
+    """Return the validator of a schema that allows no other keys."""
+    schema = json.loads((ROOT / "clpipe" / "schemas" / f"{name}.json").read_text())
+    for each in (schema, *schema.get("$defs", {}).values()):
+        if "properties" in each:
+            each["additionalProperties"] = False
+    return jsonschema.Draft202012Validator(schema)
+
+
+def check_schema(name: str, values: Any) -> None:
+    """Check that values have a schema, and no key that it lacks."""
+    error = jsonschema.exceptions.best_match(validator(name).iter_errors(values))
+    assert error is None, f"{name}: {error.json_path}: {error.message[:500]}"
+
+
+def check_files(folder: Path, most: int = 3) -> None:
+    """Check the schemas of the first files of each kind that a run has written."""
+    kinds = {"run": "*.run", "log": "run*.jsonl", "cameras": "cameras.json", "sidecar": "*.json"}
+    for name, pattern in kinds.items():
+        for path in itertools.islice(sorted(folder.rglob(pattern)), most):
+            text = path.read_text("utf-8", "surrogateescape")
+            is_clip = path.with_suffix("").suffix in (".mp4", ".mkv")
+            lines = [line for line in text.splitlines() if line.endswith("}")][:5]
+            is_sidecar = text.startswith('{\n  "clpipe"')
+            for part in lines if name == "log" else [text]:
+                if not is_clip and is_sidecar == (name == "sidecar"):
+                    check_schema(name, json.loads(part))
 
 
 def cli_output(*arguments: object, status: int = 0) -> str:

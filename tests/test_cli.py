@@ -219,7 +219,7 @@ def test_stages(clpipe):
     assert "bounded, edge_directed_median" in clpipe("stages").stdout
     assert "from the camera and ISO" in clpipe("stages", "sensor_noise").stdout
     assert "did you mean 'demosaic'" in clpipe("stages", "demosaik", status=2).stderr
-    assert len(json.loads(clpipe("stages", "--json").stdout)) >= 13
+    assert len(json.loads(clpipe("stages", "--json").stdout)["stages"]) >= 13
 
 
 def test_devices(clpipe):
@@ -296,10 +296,10 @@ def test_a_stage_is_explained_for_a_camera_and_an_iso(clpipe):
     assert low != high
     assert "from 100 to 25600" in clpipe("stages", "denoise", "--iso", 1, status=2).stderr
     assert "unknown camera" in clpipe("stages", "denoise", "--camera", "x", status=2).stderr
-    records = json.loads(clpipe("stages", "sensor_noise", "--iso", 800, "--json").stdout)
+    records = json.loads(clpipe("stages", "sensor_noise", "--iso", 800, "--json").stdout)["stages"]
     automatic = records[0]["methods"][0]["automatic"]
     assert {k for k, v in automatic.items() if v != "none"} == {"a", "b"}
-    rows = json.loads(clpipe("stages", "row_noise", "--iso", 800, "--json").stdout)
+    rows = json.loads(clpipe("stages", "row_noise", "--iso", 800, "--json").stdout)["stages"]
     assert rows[0]["methods"][0]["automatic"] == {"sigma": f"{0.12 * 2.94 / 15871:.4g}"}
 
 
@@ -310,7 +310,7 @@ def test_cameras_are_listed_and_shown(clpipe):
     shown = clpipe("cameras", "sony-a7s2", "--iso", 3200).stdout
     # K, sigGs and sigR of PMN's table at ISO 3200.
     assert "3.06" in shown and "0.4454" in shown and "PMN" in shown
-    record = json.loads(clpipe("cameras", "sony-a7s2", "--iso", 3200, "--json").stdout)
+    [record] = json.loads(clpipe("cameras", "sony-a7s2", "--iso", 3200, "--json").stdout)["cameras"]
     (noise,) = record["noise"]
     emva, paper = noise["emva1288"], noise["paper"]
     dark = (emva["system_gain"] * emva["read_noise"]) ** 2 + emva["adc_noise"] ** 2
@@ -318,7 +318,7 @@ def test_cameras_are_listed_and_shown(clpipe):
     assert noise["row_noise"] == pytest.approx(0.445435)
     b = paper["theta"] ** 2 * paper["b_before"] + paper["b_after"]
     assert b == pytest.approx(noise["signal"]["b"]) == pytest.approx((3.91938 / 15871) ** 2)
-    assert len(json.loads(clpipe("cameras", "--json").stdout)) >= 4
+    assert len(json.loads(clpipe("cameras", "--json").stdout)["cameras"]) >= 4
     text = clpipe("cameras", "canon-5d2", "--iso", 12800, status=2).stderr
     assert "found 12800, but camera canon-5d2 goes from 100 to 6400" in text
     assert "(most similar: sony-a7s2)" in clpipe("cameras", "sony-a7s", status=2).stderr

@@ -93,7 +93,7 @@ def test_help_is_a_command(clpipe):
 
 
 def test_a_part_of_a_name_lists_the_cameras(clpipe):
-    assert len(json.loads(clpipe("cameras", "Canon 5D Mark", "--json").stdout)) == 3
+    assert len(json.loads(clpipe("cameras", "Canon 5D Mark", "--json").stdout)["cameras"]) == 3
     assert "canon-80d" in clpipe("cameras", "canon").stdout
     assert "Var[y]" in clpipe("cameras", "nikon", "d850", "--iso", 800).stdout
     assert "canon-80d" not in clpipe("cameras", "nikon").stdout

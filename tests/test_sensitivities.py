@@ -124,6 +124,7 @@ def test_the_command_line(tmp_path):
     run_cli(*words, "-o", tmp_path / "d800.toml")
     shown = run_cli("cameras", tmp_path / "d800.toml").stdout
     assert "R 600 nm, G 500 nm, B 400 nm" in shown
-    record = json.loads(run_cli("cameras", tmp_path / "d800.toml", "--json").stdout)
+    [record] = json.loads(run_cli("cameras", tmp_path / "d800.toml", "--json").stdout)["cameras"]
     assert record["sensitivities"]["curves"]["R"] == [0.01, 0.1, 0.9]
-    assert json.loads(run_cli("cameras", "nikon-d800", "--json").stdout)["sensitivities"] is None
+    [bare] = json.loads(run_cli("cameras", "nikon-d800", "--json").stdout)["cameras"]
+    assert bare["sensitivities"] is None

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+FORMAT = 1  # number of the formats of sidecars, logs, cameras.json and --json
+FORMAT_KEY = "format"  # the key of this number
+
 _ARCHIVED = "$Format:%h %(describe:tags=true)$"  # git archive fills it in; see .gitattributes
 
 

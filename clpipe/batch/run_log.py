@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import full_version
+from clpipe.base.about import FORMAT, FORMAT_KEY, full_version
 from clpipe.base.errors import OutputError
 from clpipe.base.memory import peak_memory
 from clpipe.base.system import open_plain
@@ -23,6 +23,7 @@ from clpipe.batch.interrupt import INTERRUPTED
 from clpipe.batch.outcome import DONE, FAILED, LEFT_OUT, SKIPPED, STEPS, Outcome
 from clpipe.engine.clipping import WARNING_SHARE
 from clpipe.inputs.find import Shard
+from clpipe.outputs.sidecar import check_format
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +164,7 @@ class RunLog:
         self._path = path
         self._echo = echo
         self._file: int | None = None
-        self._start = {"clpipe": full_version(), "attempt": 1, **start}
+        self._start = {FORMAT_KEY: FORMAT, "clpipe": full_version(), "attempt": 1, **start}
         self._began = time.time()
         began = time.strftime("%Y%m%dT%H%M%S", time.gmtime(self._began))
         self._url = url and f"{url}/{path.stem}.{began}-{secrets.token_hex(2)}.jsonl"
@@ -303,11 +304,16 @@ def read_log(path: Path) -> Sequence[dict[str, Any]]:
 
 
 def parse_log(data: bytes) -> Sequence[dict[str, Any]]:
-    """Return the lines of a log's bytes, without one that is cut off."""
+    """Return the lines of a log's bytes, without one that is cut off.
+
+    Raises:
+        NewerFormatError: a newer version wrote it.
+    """
     lines = []
     for line in data.splitlines():
         try:
             lines.append(json.loads(line))
         except ValueError:
             continue
+        check_format(lines[-1], "run.jsonl")
     return lines

@@ -133,7 +133,7 @@ def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
         return
     camera = load_camera(name)
     if as_json:
-        show_json(camera_record(camera, iso))
+        show_json({"cameras": [camera_record(camera, iso)]})
         return
     for title, headings, rows in camera_tables(camera, iso):
         click.echo(title)
@@ -146,7 +146,7 @@ def cameras(names: tuple[str, ...], iso: float | None, as_json: bool) -> None:
 def show_cameras(cameras: Iterable[Camera], as_json: bool) -> None:
     """Print a list of cameras, as a table or as JSON."""
     if as_json:
-        show_json(list(map(camera_record, cameras)))
+        show_json({"cameras": list(map(camera_record, cameras))})
     else:
         show(("camera", "make and model", "also called", "ISO"), map(camera_row, cameras))
 

@@ -3,11 +3,12 @@
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import click
 
+from clpipe.base.about import FORMAT, FORMAT_KEY
 from clpipe.chain.toml import value_text
 
 Rows = list[tuple[str, ...]]
@@ -59,6 +60,6 @@ def show(headings: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
     Console(width=width, highlight=False, markup=False, emoji=False).print(table)
 
 
-def show_json(values: Any) -> None:
-    """Print values as JSON."""
-    click.echo(json.dumps(values, indent=2))
+def show_json(values: Mapping[str, Any]) -> None:
+    """Print values as JSON, with the number of the format; see :mod:`clpipe.commands.schema`."""
+    click.echo(json.dumps({FORMAT_KEY: FORMAT, **values}, indent=2))

@@ -41,7 +41,7 @@ def stages(name: str | None, stage_files: tuple[Path, ...], as_json: bool, **val
     selected = [all_stages()[name]] if name else list(all_stages().values())
     if as_json:
         records = [stage_record(s, context_for(s, settings)) for s in selected]
-        show_json(records)
+        show_json({"stages": records})
     elif name is None:
         headings = ("stage", "reads", "writes", "what it does", "methods (first is default)")
         show(headings, map(stage_row, selected))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from clpipe.base.about import FORMAT, FORMAT_KEY
 from clpipe.base.errors import RequestError
 from clpipe.base.reading import parse_json, read_named, read_named_text
 from clpipe.base.types import Array
@@ -94,6 +95,12 @@ def read_views(path: Path) -> list[View]:
             f"--poses {path}: this is not valid JSON ({error}); give a cameras.json, a "
             "transforms.json, or a folder with COLMAP's cameras.txt and images.txt"
         ) from None
+    number = values.get(FORMAT_KEY, 0) if isinstance(values, dict) else 0
+    if isinstance(number, int) and number > FORMAT:
+        raise RequestError(
+            f"--poses {path}: a newer clpipe wrote this file: its format has number {number}, and "
+            f"this version knows {FORMAT}. Install the newer version"
+        )
     for key, parse in PARSERS.items():
         listed = values.get(key) if isinstance(values, dict) else None
         if isinstance(listed, list) and listed:

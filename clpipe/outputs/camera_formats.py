@@ -6,7 +6,7 @@ from itertools import count
 from types import MappingProxyType
 from typing import Any
 
-from clpipe.base.about import __version__
+from clpipe.base.about import FORMAT, FORMAT_KEY, __version__
 from clpipe.outputs.output_pictures import OutputPicture, lens_record
 from clpipe.outputs.sidecar import json_text
 from clpipe.reference.intrinsics import COEFFICIENTS, OPENCV, OPENCV_FISHEYE, THIN_PRISM
@@ -70,7 +70,7 @@ def cameras_json(pictures: Sequence[OutputPicture], prefix: str = "") -> str:
         view |= lens_record(camera)
         view |= {"motion": each.motion} if each.motion else {}
         views.append(view | responses.record_for(each))
-    return json_text({"note": NOTE, **responses.record, "views": views})
+    return json_text({FORMAT_KEY: FORMAT, "note": NOTE, **responses.record, "views": views})
 
 
 def colmap(

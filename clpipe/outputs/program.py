@@ -23,7 +23,7 @@ from clpipe.images.write import versions
 from clpipe.outputs.sidecar import CachedJson
 
 # Packages that never affect a pixel: they request pictures, or read finished ones.
-WITHOUT_PIXELS = ("analysis", "commands", "dataset", "explorer", "reports", "scenes")
+WITHOUT_PIXELS = ("analysis", "commands", "dataset", "explorer", "reports", "scenes", "schemas")
 IGNORED = (".pyc", ".typed")
 
 

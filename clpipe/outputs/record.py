@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import __version__
+from clpipe.base.about import FORMAT, FORMAT_KEY, __version__
 from clpipe.base.files import Stored
 from clpipe.chain.camera_info import camera_info
 from clpipe.chain.chain import Chain
@@ -25,7 +25,7 @@ from clpipe.outputs.motion import motion_records, row_times
 from clpipe.outputs.patches import Patch, metadata_of
 from clpipe.outputs.program import all_versions, device_record, program_digest
 from clpipe.outputs.recipes import Recipe
-from clpipe.outputs.sidecar import FORMAT, FORMAT_KEY, VERSION_KEY, CachedJson, sidecar_bytes
+from clpipe.outputs.sidecar import VERSION_KEY, CachedJson, sidecar_bytes
 from clpipe.reference.intrinsics import Intrinsics
 from clpipe.stage import ImageLayer
 

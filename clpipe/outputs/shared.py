@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from clpipe.base.about import FORMAT, FORMAT_KEY
 from clpipe.base.errors import ImageError
 from clpipe.base.files import write_atomic
 from clpipe.base.reading import parse_json, read_bytes
-from clpipe.outputs.sidecar import FORMAT, FORMAT_KEY, VERSION_KEY, json_text
+from clpipe.outputs.sidecar import VERSION_KEY, json_text
 
 SHARED = "run"  # the key of a sidecar with the digest, and the extension of the file
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic_core import from_json
 
+from clpipe.base.about import FORMAT, FORMAT_KEY
 from clpipe.base.errors import ImageError
 from clpipe.base.files import sync_folder, write_atomic
 from clpipe.base.reading import parse_json, read_bytes
@@ -23,9 +24,6 @@ from clpipe.base.reading import parse_json, read_bytes
 SIDECAR = "json"  # the extension of sidecars
 
 VERSION_KEY = "clpipe"  # the first key of every sidecar
-
-FORMAT_KEY = "format"  # the key with the number of a format
-FORMAT = 1  # the number of the formats of sidecars, logs, cameras.json and --json
 
 DIGEST_KEY = "sidecar_sha256"  # the last key: the SHA-256 of all lines before its own
 

@@ -1,4 +1,4 @@
-"""Build clpipe-blender.zip, a Blender extension that develops renders (see docs/blender.md).
+"""Build clpipe-blender.zip, a Blender extension that develops renders (see docs/datasets.md).
 
 Its source is tools/blender/source. The zip contains wheels of clpipe, built from the checkout, and
 of its dependencies, chosen by pip for the machine that this runs on.

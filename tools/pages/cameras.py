@@ -28,13 +28,12 @@ FIGURES = {
 PAGE = ROOT / "docs" / "camera_quality.md"
 TEXT = """# Cameras by image quality
 
-The default chain with each built-in profile, measured by [`clpipe quality`](image_quality.md).
+[`clpipe quality`](image_quality.md) measured the default chain with each built-in profile.
 `tools/run pages cameras` writes this page.
 
-A profile contains the noise, levels, colours and filter array of a sensor. It contains no lens and
-no development. Sharpness therefore follows from the filter array, and from the denoising, which
-follows the noise. Visual noise is for a middle grey, and is lower the less noise you see. A dash
-marks an ISO that the profile does not have, or a figure that no patch of the chart shows.
+A profile contains neither a lens nor a development. Sharpness therefore depends on the filter
+array, and on denoising, which follows the noise. Visual noise is for a middle grey. A dash marks an
+ISO that the profile does not have, or a figure that no patch of the chart shows.
 
 """
 

@@ -49,11 +49,11 @@ def pages() -> dict[str, str | bytes]:
 
 
 def json_of(*command: str) -> Any:
-    """Run a command of clpipe with --json, and return the parsed output."""
+    """Run a command of clpipe with --json, and return the list that it prints."""
     result = CliRunner().invoke(main, [*command, "--json"], catch_exceptions=False)
     if result.exit_code:
         raise RuntimeError(result.output)
-    return json.loads(result.output)
+    return json.loads(result.output)[command[0]]
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
