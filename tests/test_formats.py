@@ -158,7 +158,12 @@ def test_files_of_many_kinds_of_runs_have_their_schemas(write_exr, clpipe):
             ("--truth", "iid", "--truth", "intensity", "--set", "exposure.method=auto"),
             ("--until", "quantize", "--format", "dng", "--iso", "100,800"),
             ("--sequence", "-c", "video", "--set", "shutter.line_time=1e-5"),
-            ("--set", "vignetting.method=cosine_fourth", "--set", "distortion.method=brown_conrady"),
+            (
+                "--set",
+                "vignetting.method=cosine_fourth",
+                "--set",
+                "distortion.method=brown_conrady",
+            ),
         ]
     ):
         lens = ("--set", "render.fx=30", "--set", "render.fy=30")

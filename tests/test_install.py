@@ -80,18 +80,23 @@ def test_packages_that_are_missing_are_named(clpipe, monkeypatch, command, messa
 
 
 def test_extras_have_these_packages():
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    extras_of = listed["optional-dependencies"]
-
-    def packages(extra):
-        for requirement in extras_of[extra]:
-            name, _, inner = re.match(r"([\w-]+)(\[(\w+)\])?", requirement).groups()
-            yield from packages(inner) if inner else [name]
-
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    packages = {
+        extra: {(found := Requirement(text)).name: str(found.specifier) for text in listed}
+        for extra, listed in project["optional-dependencies"].items()
+    }
     for extra, modules in extras.EXTRAS.items():
         if extra != "cloud":
-            assert sorted(packages(extra)) == sorted(modules)
-    assert {*transfers.PACKAGES.values(), "fsspec"} == {*packages("cloud")}
+            assert sorted(packages[extra]) == sorted(modules)
+    assert {*transfers.PACKAGES.values(), "fsspec"} == {*packages["cloud"]}
+    for extra in ("annotations", "calibrate", "dask", "docs", "explore", "lens", "report", "video"):
+        assert packages[extra].items() <= packages["dev"].items(), extra
+
+
+def test_the_name_of_the_distribution_is_one_line():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    for extra, listed in project["optional-dependencies"].items():
+        assert project["name"] not in [Requirement(text).name for text in listed], extra
 
 
 def test_no_text_installs_another_project_of_that_name():
@@ -126,14 +131,11 @@ def test_pocl_is_asked_for_only_where_it_has_a_wheel(system, machine, expected):
 
 
 def needed(project, extra):
-    """What pyproject.toml asks for with an extra, with what its extras of clpipe ask for."""
-    for text in project["optional-dependencies"][extra] if extra else project["dependencies"]:
-        requirement = Requirement(text)
-        if requirement.name == "clpipe":
-            for each in requirement.extras:
-                yield from needed(project, each)
-        else:
-            yield requirement
+    """What pyproject.toml asks for with an extra."""
+    yield from map(
+        Requirement,
+        project["optional-dependencies"][extra] if extra else project["dependencies"],
+    )
     if extra:
         yield from needed(project, "")
 

@@ -23,10 +23,8 @@ _ARCHIVED = "$Format:%h %(describe:tags=true)$"  # git archive fills it in; see 
 def full_version() -> str:
     """Return the version with the commit, in the form of PEP 440.
 
-    ``0.1.0`` is the commit with the tag ``v0.1.0``. ``0.1.0.post5+g1234567`` is the fifth commit
-    after this tag. ``0.1.0.dev632+g1234567`` is a commit before the tag, number 632 of the history.
-    The number is 0 if it is unknown, for example in a shallow clone. A copy of a checkout without
-    its history has the version ``0.1.0.dev0+unknown``.
+    ``0.1.0`` is the commit with the tag ``v0.1.0``. ``0.1.0+g1234567`` is another commit. A copy of
+    a checkout without its history has the version ``0.1.0+unknown``.
 
     The version ends in ``dirty`` if files in ``clpipe`` or ``kernels`` differ from the commit. A
     wheel or an sdist has the version of the checkout from which it was built.
@@ -40,14 +38,14 @@ def full_version() -> str:
         _version_from_metadata(root)
         or _version_from_git(root)
         or _version_from_archive(_ARCHIVED)
-        or _format_version("", "unknown", 0)
+        or _format_version("", "unknown")
     )
 
 
 def _version_from_metadata(root: "Path") -> str:
     """Return the version in the metadata of an sdist or an installed wheel; "" if there is none."""
     prefix = "Version: "
-    for path in (root / "PKG-INFO", *root.glob("clpipe-*.dist-info/METADATA")):
+    for path in (root / "PKG-INFO", *root.glob("*clpipe*.dist-info/METADATA")):
         if path.is_file():
             lines = path.read_text("utf-8").splitlines()
             return next(
@@ -73,12 +71,11 @@ def _version_from_git(root: "Path") -> str:
     if not (root / ".git").exists():
         return ""
     try:
-        is_shallow, commit = git_output(
-            "rev-parse", "--is-shallow-repository", "--short", "HEAD"
-        ).split()
-        count = 0 if is_shallow == "true" else int(git_output("rev-list", "--count", "HEAD"))
-        described = git_output("describe", "--tags", "--match", f"v{__version__}", "--always")
-        version = _format_version(described, f"g{commit}", count)
+        commit = git_output("rev-parse", "--short", "HEAD")
+        tags = git_output("tag", "--points-at", "HEAD").split()
+        version = _format_version(
+            f"v{__version__}" if f"v{__version__}" in tags else "", f"g{commit}"
+        )
         is_dirty = git_output("status", "--porcelain", "--", "clpipe", "kernels")
     except (OSError, subprocess.SubprocessError, ValueError):
         return ""
@@ -88,18 +85,14 @@ def _version_from_git(root: "Path") -> str:
 def _version_from_archive(text: str) -> str:
     """Return the version that ``git archive`` has filled in; "" if it has not."""
     commit, _, described = text.partition(" ")
-    return "" if commit.startswith("$") else _format_version(described, f"g{commit}", 0)
+    return "" if commit.startswith("$") else _format_version(described, f"g{commit}")
 
 
-def _format_version(described: str, commit: str, count: int) -> str:
+def _format_version(tag: str, commit: str) -> str:
     """Return the version of a commit.
 
     Args:
-        described: the output of ``git describe``, such as v0.1.0 or v0.1.0-5-g1234567.
-        commit: the commit's name, such as g1234567.
-        count: the number of commits up to this one; 0 if unknown.
+        tag: its tag, such as v0.1.0; other texts are no release.
+        commit: its name, such as g1234567.
     """
-    tag, _, since = described.partition("-")
-    if tag != f"v{__version__}":
-        return f"{__version__}.dev{count}+{commit}"
-    return f"{__version__}.post{since.partition('-')[0]}+{commit}" if since else __version__
+    return __version__ if tag == f"v{__version__}" else f"{__version__}+{commit}"

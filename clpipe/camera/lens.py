@@ -147,7 +147,8 @@ def _database() -> Any:
     except ImportError:
         raise KeyedError(
             "lens",
-            f"lens: lensfun's database needs lensfunpy. Run: {INSTALL}",
+            "lens: lensfun's database needs lensfunpy, which is in the extra 'lens'. Run: "
+            + INSTALL,
         ) from None
 
 

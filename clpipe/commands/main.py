@@ -25,7 +25,7 @@ from clpipe.commands.notices import NOTICES
 # Commands by heading of the help. Each is a module of this package that defines a function of its
 # name.
 GROUPS = {
-    "Make pictures": ("run", "replay", "dataset", "stream"),
+    "Make pictures": ("demo", "run", "replay", "dataset", "stream"),
     "View and measure results": (
         "status",
         "report",

@@ -26,5 +26,8 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise ImportError(f"clpipe.torch needs torch; {install_command('torch')}") from None
+        raise ImportError(
+            f"clpipe.torch needs torch, which is in the extra 'train'. Run: "
+            f"{install_command('torch')}"
+        ) from None
     return getattr(raw_noise, name)
