@@ -14,6 +14,8 @@ import pytest
 from PIL import Image
 
 import clpipe as package
+from clpipe.camera.profile import built_in_cameras
+from clpipe.chain.registry import all_stages
 from clpipe.reference.panorama import CUBE
 from tests.conftest import ROOT, STILL_LIFE, WRITTEN, written
 from tests.dng import write_dng
@@ -270,9 +272,15 @@ def test_the_pictures_of_the_architecture_are_those_of_the_code(name):
     assert (DOCS / name).read_text("utf-8") == drawn, "run tools/run pages architecture"
 
 
-@pytest.mark.parametrize("name", ["report", "explore"])
+def test_the_readme_counts_what_there_is():
+    text = (ROOT / "README.md").read_text()
+    counts = {int(n): what for n, what in re.findall(r"- \*\*(\d+) (\w+)\*\*", text)}
+    assert counts == {len(built_in_cameras()): "cameras", len(all_stages()): "stages"}
+
+
+@pytest.mark.parametrize("name", ["screen_report", "screen_explore", "explore_iso"])
 def test_screenshots_show_the_present_pages(name):
-    with Image.open(DOCS / f"screen_{name}.webp") as picture:
+    with Image.open(DOCS / f"{name}.webp") as picture:
         assert picture.info["xmp"].decode() == screens.pages_digest(), "run tools/run pages screens"
 
 

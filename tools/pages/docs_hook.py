@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from clpipe.base.vocabulary import DISPOSITIONS, Vocabulary
 from clpipe.chain.registry import all_stages
-from clpipe.commands.main import main
+from clpipe.commands.main import COMMANDS, main, summary
 from clpipe.images.colour_names import ALIASES, DATA, DECODERS, LINEAR, PRIMARIES
 from clpipe.images.vocabularies import CLIP, DNG, JPEG, LAYERS, OPENEXR, PNG, TIFF
 from clpipe.inputs.annotation_keys import BOP, COCO, KITTI
@@ -44,6 +44,7 @@ def pages() -> dict[str, str | bytes]:
         "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
         "security.md": (ROOT / "SECURITY.md").read_text("utf-8"),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8").replace("](docs/", "]("),
+        **{f"schemas/{p.name}": p.read_bytes() for p in (ROOT / "clpipe/schemas").iterdir()},
         **notebook_files(ROOT / "docs" / f"{NOTEBOOK}.ipynb"),
     }
 
@@ -242,10 +243,14 @@ def configurations_page() -> str:
 def cli_page() -> str:
     """Generate the page of the command line; mkdocs-click inserts the commands."""
     module = main.callback.__module__ if main.callback else ""
+    listed = [[f"`clpipe {name}`", summary(name)] for name in COMMANDS]
+    commands = table(["command", "what it does"], listed)
     return f"""# Command line
 
-This page is generated from the program. `clpipe COMMAND --help` prints the same text.
+This page is generated from the program. `clpipe COMMAND --help` prints the same text. The help of large commands shows
+only the most common options; `--help-all` shows all.
 
+{commands}
 | exit status | meaning |
 |---|---|
 | 0 | success |

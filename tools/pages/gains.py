@@ -22,7 +22,7 @@ LABELS = {
     "real": "another camera's real pairs",
     "clpipe": "clpipe",
 }
-LEFT, PANEL, GAP, TOP, ROW = 270, 250, 30, 56, 30  # px
+LEFT, PANEL, GAP, TOP, ROW = 270, 250, 80, 56, 30  # px; the means are in the gap
 LOW, HIGH = -1.0, 5.0  # dB
 STYLE = """<style>
 text { font: 13px sans-serif; fill: #24292e; dominant-baseline: middle; }
@@ -75,7 +75,7 @@ def drawn(panels: Mapping[str, Mapping[str, np.ndarray]]) -> str:
             if own.size:
                 mean = float(own.mean())
                 parts.append(upright(left + across(mean), y - 10, y + 10, "mean"))
-                parts.append(text(left + PANEL - 6, y, f"{mean:+.1f}", "pale"))
+                parts.append(text(left + PANEL + 18, y, f"{mean:+.1f}", "pale"))
             parts.append("</g>")
     width = LEFT + len(panels) * (PANEL + GAP)
     label = "What a small denoiser gains on real cameras' pictures, by what it was trained on"

@@ -25,6 +25,7 @@ from tools.shared.plots import caption, caption_spectrum, save, spectrum
 from tools.shared.tables import COLUMNS, cells
 
 ISOS = (800, 1600, 3200, 6400)
+CAMERAS = {"5dmark3": "Canon 5D Mark III", "d600": "Nikon D600", "d800": "Nikon D800"}
 PLACES = ("saturated", "textured")  # of crops
 SCALE = 4  # their enlargement
 
@@ -72,7 +73,17 @@ def read_pairs(folder: Path) -> dict[str, list[Pair]]:
     found: dict[str, list[Pair]] = defaultdict(list)
     for each in find_pairs(folder):
         found[each.camera].append(Pair(_read(each.real), _read(each.mean)))
-    return dict(found)
+    return {name_of(camera): pairs for camera, pairs in found.items()}
+
+
+def name_of(key: str) -> str:
+    """Return the name of a camera and its ISO, from the name of its files.
+
+    >>> name_of("5dmark3_iso3200")
+    'Canon 5D Mark III, ISO 3200'
+    """
+    camera, _, iso = key.partition("_iso")
+    return f"{CAMERAS.get(camera, camera)}, ISO {iso}"
 
 
 def _read(path: Path) -> Array:
@@ -173,7 +184,11 @@ def draw(
             levels, sigmas = sigma_by_intensity(pairs)
             intensity.plot(levels, sigmas, style, color=line.get_color(), label=name)
     caption_spectrum(spectra, "Power spectrum of luma noise")
-    titles = "Noise by intensity", "luma without noise, levels", "sigma of luma, levels"
+    titles = (
+        "Noise by intensity",
+        "luma without noise, 8-bit levels",
+        "standard deviation of luma noise, 8-bit levels",
+    )
     caption(intensity, *titles)
     intensity.set_ylim(bottom=0)
     figure.legend(*spectra.get_legend_handles_labels(), loc="outside right center")

@@ -1,4 +1,6 @@
-"""Make screenshots of clpipe's pages: docs/screen_report.webp and docs/screen_explore.webp.
+"""Make pictures of clpipe's pages: docs/screen_report.webp and docs/screen_explore.webp.
+
+It also makes docs/explore_iso.webp, an animation of the ISO's slider in the explorer.
 
     tools/run pages screens
 
@@ -28,6 +30,9 @@ from tools import RENDER, ROOT
 from tools.shared.options import parser_of
 
 SIZE = {"width": 1366, "height": 768}
+ISOS = [100 * 2 ** (step / 2) for step in range(15)]
+FRAME = 300, 1200  # ms; a frame of the animation, and its first and last one
+ANIMATED = 911, 512  # px
 
 
 def pages_digest() -> str:
@@ -70,6 +75,32 @@ def explorer(page: Any) -> None:
     page.goto(server.address)
     page.wait_for_timeout(6000)
     save_screenshot(page, "explore")
+    animate(page)
+
+
+def animate(page: Any) -> None:
+    """Write an animation of the page whose picture follows the ISO."""
+    slider = page.get_by_label("ISO, slider")
+    frames = []
+    for iso in ISOS:
+        slider.evaluate(
+            "(e, iso) => { e.value = Math.log2(iso); e.dispatchEvent(new Event('input')); }", iso
+        )
+        page.wait_for_timeout(1500)
+        picture = Image.open(BytesIO(page.screenshot())).convert("RGB")
+        frames.append(picture.resize(ANIMATED, Image.Resampling.LANCZOS))
+    path = ROOT / "docs" / "explore_iso.webp"
+    durations = [FRAME[number in (0, len(frames) - 1)] for number in range(len(frames))]
+    options = {"quality": 60, "method": 6, "xmp": pages_digest().encode(), "loop": 0}
+    frames[0].save(
+        path,
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        minimize_size=True,
+        **options,
+    )
+    print(path.relative_to(ROOT))
 
 
 def main() -> None:

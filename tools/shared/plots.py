@@ -29,7 +29,7 @@ def caption(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 
 def caption_spectrum(axes: Axes, title: str) -> None:
     """Set the titles and the scale of a plot of power spectra."""
-    caption(axes, title, "cycles per pixel", "power; independent: 1")
+    caption(axes, title, "spatial frequency, cycles per pixel", "power (1: independent noise)")
     axes.set_yscale("log")
     axes.yaxis.set_minor_formatter("")
     axes.set_yticks(ticks := (0.1, 0.2, 0.5, 1, 2, 5, 10), [f"{tick:g}" for tick in ticks])
