@@ -326,10 +326,8 @@ def test_what_is_said_without_lensfunpy(clpipe, monkeypatch):
     by_name._load_database.cache_clear()
     monkeypatch.setitem(sys.modules, "lensfunpy", None)
     stderr = clpipe("plan", "--lens", "any", status=2).stderr
-    assert (
-        "lensfun's database needs lensfunpy, which is in the extra 'lens'. Run: pip install lensfunpy"
-        in stderr
-    )
+    assert "lensfun's database needs lensfunpy, which is in the extra 'lens'." in stderr
+    assert "Run: pip install lensfunpy" in stderr
 
 
 def test_kernels_are_not_refused_for_the_image_that_compiles_them(device):

@@ -518,3 +518,25 @@ def test_a_single_render_may_have_subframes_and_annotations(write_exr, clpipe):
     centre = size["width"] / 2, size["height"] / 2
     assert (x + width / 2, y + height / 2) == pytest.approx(centre, abs=0.1)
     assert width == pytest.approx(8 * 40 / 60, rel=0.02)
+
+
+def test_panoramas_have_no_subframes_annotations_or_rolling_shutter(write, write_exr, clpipe):
+    for name, image in zip(CUBE, images_of(PANORAMAS["cube"]), strict=True):
+        write(f"in/room_{name}.exr", **colours(image))
+    wide = options_of("kannala_brandt")
+    two = ("--set", "shutter.subframes=2", *wide, "--device", "numpy", *STAGES, "--format", "exr")
+    assert "also be a sub-frame" in clpipe("run", "in", "-o", "a", *two, status=2).output
+    pytest.importorskip("pycocotools", reason="needs pycocotools, in the extra annotations")
+    box = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [20, 12, 8, 8], "area": 64}
+    images = [{"id": 1, "file_name": "room_front.exr", "width": SIDE, "height": SIDE}]
+    coco = {"images": images, "categories": [{"id": 1, "name": "a"}], "annotations": [box]}
+    Path("coco.json").write_text(json.dumps(coco))
+    run = ("run", "in", "-o", "b", *wide, *RUN, "--annotations", "coco.json")
+    assert "annotations of panoramas cannot be warped by a wide lens" in clpipe(*run).output
+    for number in range(2):
+        write_exr(f"one/f{number}.exr", np.full((32, 48, 3), 0.1))
+    lens = {"method": "kannala_brandt", "fx": 40, "field_of_view": 30}
+    lens = [x for k, v in lens.items() for x in ("--set", f"projection.{k}={v}")]
+    rolling = ("--set", "shutter.line_time=1e-4", "--set", "render.fx=60", *two[:2], *STAGES)
+    output = clpipe("run", "one", "-o", "c", *lens, *rolling, "--device", "numpy", status=(1, 2))
+    assert "rolling shutter" in " ".join(output.output.split())

@@ -41,7 +41,7 @@ def pages() -> dict[str, str | bytes]:
         "configurations.md": configurations_page(),
         "cli.md": cli_page(),
         "statements.md": statements_page(),
-        "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8"),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text("utf-8").replace("](docs/", "]("),
         "security.md": (ROOT / "SECURITY.md").read_text("utf-8"),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text("utf-8").replace("](docs/", "]("),
         **{f"schemas/{p.name}": p.read_bytes() for p in (ROOT / "clpipe/schemas").iterdir()},
