@@ -34,7 +34,7 @@ def folder(write_exr):
         (("sony-a7r2",), "use 'clpipe cameras sony-a7r2'"),
         (("render.exr",), "use 'clpipe run render.exr -o OUT'"),
         (("version",), "Did you mean 'clpipe --version'?"),
-        (("quux",), "The commands are run, replay, "),
+        (("quux",), "The commands are demo, run, replay, "),
         (("--iso", "800", "run"), "Options follow the command"),
         (("stages", "noise"), "did you mean 'sensor_noise', 'row_noise', 'column_noise' or 'pict"),
         ((*RUN, "--skip", "noize"), "did you mean 'noise'?); allowed: noise, "),
@@ -185,7 +185,12 @@ def test_every_command_has_a_form_for_programs():
     for name in COMMANDS:
         command = main.get_command(click.Context(main), name)
         options = {option for each in command.params for option in each.opts}
-        lines = {"run": "--json-lines", "dataset": "--json-lines", "stream": "--log"}
+        lines = {
+            "demo": "--json-lines",
+            "run": "--json-lines",
+            "dataset": "--json-lines",
+            "stream": "--log",
+        }
         assert lines.get(name, "--json") in options, name
 
 

@@ -42,8 +42,8 @@ COMMANDS = """
 --set output.date=today => output.date: found 'today': write the date like 2026
 --set render.focal_length=0 => render.focal_length: found 0: .. greater than 0
 --set render.exposure_time=fast => render.exposure_time: found 'fast': .. number
---iso random => or a range from which the ISO of each image is drawn, such as 100..6400
---iso 100-6400 => or a range from which the ISO of each image is drawn, such as 100..6400
+--iso random => To draw the ISO of each image, use a range such as 100..6400
+--iso 100-6400 => To draw the ISO of each image, use a range such as 100..6400
 --iso 100..x => iso: found '100..x'; expected the two ends of a range of random ISOs
 --iso 6400..100 => iso: log_uniform: found [6400, 100]; put the lower end first
 --iso 100..1e7 => found 1e+07, but camera sony-a7r2 goes from 100 to 25600

@@ -133,9 +133,10 @@ def run(
             stages replaces their development.
         camera: a built-in camera, by name or model, or a profile (.toml). With several, each
             camera's pictures go to OUT/CAMERA. None is sony-a7r2.
-        iso: the ISO. Noise and denoising depend on it. With several, each ISO's pictures go to a
-            directory such as OUT/iso800. 100..6400 draws one for each image, and every octave of
-            the range is equally likely; in Python, (100, 6400) does the same. None is 100.
+        iso: the ISO, several, or a range. Noise and denoising depend on it. With several, such as
+            100,800, each ISO's pictures go to a directory such as OUT/iso800. With a range, such as
+            100..6400, each image draws one, and every octave is equally likely. In Python,
+            (100, 6400) is a range. None is 100.
         start_at: the first stage to run. Inputs are then images of the kind that it reads, such as
             kept images or mosaics.
         until: the last stage to run.

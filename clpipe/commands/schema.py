@@ -12,7 +12,14 @@ MACHINE = {"clpipe": str, "device": Object, "versions": dict[str, str]}
 # The keys of each command, with their types. Keys that end in "?" may be missing.
 KEYS: dict[str, dict[str, Any]] = {
     "bench": MACHINE
-    | {"batches?": Objects, "chain?": Object, "launches?": Objects, "width?": int, "height?": int}
+    | {
+        "methods?": Any,
+        "batches?": Objects,
+        "chain?": Object,
+        "launches?": Objects,
+        "width?": int,
+        "height?": int,
+    }
     | dict.fromkeys(("mp_per_s?", "bytes_per_pixel?", "copy_gb_per_s?", "first_run_s?"), float),
     "calibrate": {"profile": str, "picture": str, "make?": str, "model?": str}
     | {"isos?": Objects, "figures?": Object},

@@ -147,7 +147,7 @@ def check_isos(isos: float | str | Sequence[float]) -> tuple[float, ...]:
     if not all(math.isfinite(iso) and iso > 0 for iso in numbers):
         raise RequestError(
             f"--iso: found {found}; expected numbers above 0 with commas between them, such as "
-            "100,800,3200, or a range from which the ISO of each image is drawn, such as 100..6400"
+            "100,800,3200. To draw the ISO of each image, use a range such as 100..6400"
         )
     names = [f"{iso:g}" for iso in numbers]
     for name in names:

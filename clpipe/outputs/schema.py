@@ -172,7 +172,9 @@ class Sidecar(TypedDict):
     program: Annotated[Sha256, Field(description="A digest of clpipe and its libraries.")]
     request: Request
     run: Annotated[Sha256, Field(description="The SHA-256 of the file with what its run shares.")]
-    sidecar_sha256: NotRequired[Annotated[Sha256, Field(description="Of all lines before.")]]
+    sidecar_sha256: NotRequired[
+        Annotated[Sha256, Field(description="The digest of all lines before.")]
+    ]
     index: NotRequired[Annotated[float, Field(description="In a clip: the frame's place.")]]
     time: NotRequired[Annotated[float | None, Field(description="In a clip: its time, s.")]]
     clip: NotRequired[Annotated[Values, Field(description="The clip.")]]

@@ -247,8 +247,8 @@ def cli_page() -> str:
     commands = table(["command", "what it does"], listed)
     return f"""# Command line
 
-This page is generated from the program. `clpipe COMMAND --help` prints the same text. The help of large commands shows
-only the most common options; `--help-all` shows all.
+This page is generated from the program. `clpipe COMMAND --help` prints the same text. The help of
+large commands shows only the most common options; `--help-all` shows all.
 
 {commands}
 | exit status | meaning |
