@@ -283,7 +283,7 @@ def test_bursts_of_several_scenes_are_one_figure_for_each_iso(tmp_path, measured
         assert one["energy_left_2x2"] == pytest.approx(0.25, abs=0.02)
         assert sum(one["histogram"]["samples"]) == one["samples"]
     low = measured(*sorted((out / "low").glob("*.frame?.png")))
-    assert low == by_iso["100"] | {"images": low["images"]}
+    assert low == by_iso["100"] | {"images": low["images"], "format": 1}
     text = clpipe("measure", out).stdout
     assert "6 x display in 2 bursts, 128x96, ISO 100, against the mean of their burst" in text
     assert "3 x display, 128x96, ISO 800, against their mean" in text

@@ -14,6 +14,7 @@ from clpipe.images.read import read_image
 from clpipe.images.tags import upright
 from clpipe.images.two_lights import camera_to_srgb
 from clpipe.images.write import write_exr
+from clpipe.outputs.record import whole_step
 from clpipe.reference.cfa import PATTERNS, by_site
 from tests.conftest import STILL_LIFE, written
 from tests.conftest import cli_output as clpipe
@@ -52,7 +53,7 @@ def sidecar(path):
 
 
 def parameters(path):
-    return {stage["name"]: stage["parameters"] for stage in sidecar(path)["stages"]}
+    return {stage["name"]: whole_step(stage)["parameters"] for stage in sidecar(path)["stages"]}
 
 
 LAMP_WHITE, DAYLIGHT = np.array([1.0985, 1.0, 0.3558]), SRGB_TO_XYZ.sum(1)  # XYZ of A and D65

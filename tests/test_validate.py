@@ -104,9 +104,9 @@ def test_real_pairs_are_found_by_camera_and_measured_by_their_median(tmp_path):
         Image.fromarray(pair.noisy).save(tmp_path / f"x_iso3200_{number}_real.png")
         Image.fromarray(pair.clean).save(tmp_path / f"x_iso3200_{number}_mean.png")
     found = real_cameras.read_pairs(tmp_path)
-    assert {name: len(each) for name, each in found.items()} == {"x_iso3200": 3}
+    assert {name: len(each) for name, each in found.items()} == {"x, ISO 3200": 3}
     middle = sorted(pair.signature()["rms"] for pair in pairs)[1]
-    assert real_cameras.medians(found["x_iso3200"])["rms"] == middle
+    assert real_cameras.medians(found["x, ISO 3200"])["rms"] == middle
     (tmp_path / "x_iso3200_2_mean.png").unlink()
     with pytest.raises(SystemExit, match=r"2_real.png has no x_iso3200_2_mean.png"):
         real_cameras.read_pairs(tmp_path)

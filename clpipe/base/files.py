@@ -191,9 +191,10 @@ def _create_temporary(temporary: Path) -> BinaryIO:
 
 
 @contextlib.contextmanager
-def atomic_file(path: Path) -> Iterator[BinaryIO]:
+def atomic_file(path: Path, stem: str = "") -> Iterator[BinaryIO]:
     """Open a new file that replaces ``path`` when all of it is on the disk.
 
+    The temporary name begins with a stem, which is that of ``path`` unless another one is passed.
     Links are not followed. If the file cannot be written, or the body raises, ``path`` does not
     change. See also :func:`unsynced_files` and :func:`deferred_files`.
 
@@ -201,7 +202,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         ImageError: the file cannot be written.
     """
     temporary = path.with_name(
-        f".{shorten_name(path.stem)}.{secrets.token_hex(4)}.part{path.suffix}"
+        f".{shorten_name(stem or path.stem)}.{secrets.token_hex(4)}.part{path.suffix}"
     )
     is_written = False
     try:

@@ -46,9 +46,10 @@ class StagedWriter(OutputWriter):
         """Return the name of a job's file before it is packed."""
         return f"{self.folder}/{self.folders[job.stem]}/{job.stem}{ending}"
 
-    def shared_folder(self, sidecar: Path) -> Path:
-        """Return the folder of what pictures share: that of the tars and clips."""
-        return self.folder
+    def shared_place(self, sidecar: Path) -> Path:
+        """Return the path of a sidecar's tar or clip, next to the file that pictures share."""
+        parts = sidecar.relative_to(self.folder).parts
+        return self.folder / next(p for p in parts if p.startswith(STAGING)).removeprefix(STAGING)
 
     def write(self, *arguments: Any) -> dict[Path, Stored]:
         """Write the images of one rendition. They go into the tar, so they need no fsync."""

@@ -86,13 +86,16 @@ class ImageWorker(JobLoader):
 
     def _shares_response(self, job: Job) -> bool:
         """Return whether the pictures of a run have one response to greys, or a few."""
-        steps = {s.name for s in self.chain.steps if s.stage.role is StageRole.RESPONSE}
-        return not steps & {*self._drawn_steps, *job.values}
+        steps, are_drawn = self._response_steps
+        return not are_drawn and steps.isdisjoint(job.values)
 
     @cached_property
-    def _drawn_steps(self) -> set[str]:
-        """The steps whose parameters are drawn."""
-        return {key.partition(".")[0] for key in self.loader.request.settings().draws}
+    def _response_steps(self) -> tuple[frozenset[str], bool]:
+        """The steps of the response to greys, and whether a parameter of one is drawn."""
+        response = StageRole.RESPONSE
+        steps = frozenset(s.name for s in self.chain.steps if s.stage.role is response)
+        draws = self.loader.request.settings().draws
+        return steps, any(key.partition(".")[0] in steps for key in draws)
 
     def compile(self, device: Device | None) -> None:
         """Compile the kernels of the first chain for a device.
@@ -248,7 +251,7 @@ class ImageWorker(JobLoader):
             carried,
             state.patches,
         )
-        write_sidecar(path, share(record, writer.shared_folder(path), self._shares_response(job)))
+        write_sidecar(path, share(record, writer.shared_place(path), self._shares_response(job)))
         return [str(f.relative_to(writer.folder)) for f in (*files, path)]
 
 

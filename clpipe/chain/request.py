@@ -283,7 +283,7 @@ def without_defaults(record: Mapping[str, Any]) -> dict[str, Any]:
     >>> without_defaults({"files": {}, "keep": [], "image_name": "a.exr"})
     {'image_name': 'a.exr', 'files': {}}
     """
-    kept = {k: record[k] for k in RECORDED_FIELDS if record.get(k, _DEFAULTS[k]) != _DEFAULTS[k]}
+    kept = {k: record[k] for k in RECORDED_FIELDS if k in record and record[k] != _DEFAULTS[k]}
     return {**kept, "files": record["files"]}
 
 

@@ -5,13 +5,16 @@ versions of libraries, and the response to greys. A sidecar without it still rep
 """
 
 import hashlib
+import os
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from clpipe.base.about import FORMAT, FORMAT_KEY
+from clpipe.base.about import FORMAT, FORMAT_KEY, __version__
+from clpipe.base.cache import Identity
 from clpipe.base.errors import ImageError
-from clpipe.base.files import write_atomic
+from clpipe.base.files import atomic_file
 from clpipe.base.reading import parse_json, read_bytes
 from clpipe.outputs.sidecar import VERSION_KEY, json_text
 
@@ -30,28 +33,41 @@ def shared_path(folder: Path, digest: str) -> Path:
     return folder / f"{digest[:16]}.{SHARED}"
 
 
-def share(record: Mapping[str, Any], folder: Path, shares_response: bool) -> dict[str, Any]:
+def share(record: Mapping[str, Any], place: Path, shares_response: bool) -> dict[str, Any]:
     """Return a sidecar's values without those that its run shares, and write these to a file.
 
     Args:
         record: all values.
-        folder: the folder of the file.
+        place: a path next to the file, whose stem names the run's image, tar or clip.
         shares_response: whether the other pictures of the run have the same response.
 
     Raises:
         ImageError: the file cannot be written.
     """
     values = {key: value for key, value in record.items() if key not in ENVIRONMENT}
-    shared = {key: record[key] for key in (VERSION_KEY, *ENVIRONMENT)}
+    response = None
     if shares_response and (photometry := record[PHOTOMETRY]):
         values[PHOTOMETRY] = {k: v for k, v in photometry.items() if k != RESPONSE}
-        shared[RESPONSE] = photometry[RESPONSE]
-    data = json_text({FORMAT_KEY: FORMAT, **shared}).encode()
-    digest = hashlib.sha256(data).hexdigest()
-    path = shared_path(folder, digest)
-    if not path.exists():
-        write_atomic(path, data)
+        response = Identity(photometry[RESPONSE])
+    device, versions = (record[key] for key in ENVIRONMENT)
+    data, digest = _encoded(tuple(device.items()), Identity(versions), response)
+    name = f"{digest[:16]}.{SHARED}"
+    if not os.path.exists(os.path.join(os.path.dirname(place), name)):
+        with atomic_file(place.with_name(name), place.stem) as file:
+            file.write(data)
     return {**values, SHARED: digest}
+
+
+@lru_cache(maxsize=64)
+def _encoded(
+    device: tuple[tuple[str, Any], ...], versions: Identity, response: Identity | None
+) -> tuple[bytes, str]:
+    """Return the bytes of a shared file, and their SHA-256. Images have the same objects."""
+    shared = {FORMAT_KEY: FORMAT, VERSION_KEY: __version__}
+    values = zip(ENVIRONMENT, (dict(device), versions.of), strict=True)
+    shared |= {**dict(values), **({RESPONSE: response.of} if response else {})}
+    data = json_text(shared).encode()
+    return data, hashlib.sha256(data).hexdigest()
 
 
 def with_shared(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:

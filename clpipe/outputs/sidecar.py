@@ -266,7 +266,7 @@ def json_text(record: Mapping[str, Any]) -> str:
             text = f"[\n{items}\n  ]"
         else:
             text = _text_of(value)
-        lines.append(f"  {to_json(key)}: {text}")
+        lines.append(f'  "{key}": {text}')  # keys are names, without characters to escape
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 

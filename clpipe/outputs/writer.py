@@ -183,9 +183,9 @@ class OutputWriter(OutputPlan):
                 outputs[path] = write_floats(path, final, *last)
         return outputs
 
-    def shared_folder(self, sidecar: Path) -> Path:
-        """Return the folder of what the pictures next to a sidecar share."""
-        return sidecar.parent
+    def shared_place(self, sidecar: Path) -> Path:
+        """Return a path next to the file that a sidecar shares with others of its run."""
+        return sidecar
 
     def _make_folder_of(self, job: Job) -> None:
         """Create the folders between the output directory, which must exist, and a job's files.

@@ -83,7 +83,8 @@ def name_of(key: str) -> str:
     'Canon 5D Mark III, ISO 3200'
     """
     camera, _, iso = key.partition("_iso")
-    return f"{CAMERAS.get(camera, camera)}, ISO {iso}"
+    name = CAMERAS.get(camera, camera)
+    return f"{name}, ISO {iso}" if iso else name
 
 
 def _read(path: Path) -> Array:
