@@ -127,15 +127,14 @@ def check_schema(name: str, values: Any) -> None:
 
 def check_files(folder: Path, most: int = 3) -> None:
     """Check the schemas of the first files of each kind that a run has written."""
-    kinds = {"run": "*.run", "log": "run*.jsonl", "cameras": "cameras.json", "sidecar": "*.json"}
+    kinds = {"run": "*.run", "log": "run*.jsonl", "cameras": "cameras.json", "sidecar": "*.json*"}
+    folder = folder.parent if folder.suffix in (".mp4", ".mkv") else folder
     for name, pattern in kinds.items():
         for path in itertools.islice(sorted(folder.rglob(pattern)), most):
             text = path.read_text("utf-8", "surrogateescape")
-            is_clip = path.with_suffix("").suffix in (".mp4", ".mkv")
             lines = [line for line in text.splitlines() if line.endswith("}")][:5]
-            is_sidecar = text.startswith('{\n  "clpipe"')
-            for part in lines if name == "log" else [text]:
-                if not is_clip and is_sidecar == (name == "sidecar"):
+            for part in lines if path.suffix == ".jsonl" else [text]:
+                if part.lstrip("{ \n").startswith('"clpipe"') == (name == "sidecar"):
                     check_schema(name, json.loads(part))
 
 
