@@ -16,6 +16,7 @@ from clpipe.base.pure import pure
 from clpipe.base.tracing import NotTraceableError, Trace, call
 from clpipe.camera.profile import built_in_cameras, load_camera
 from clpipe.chain.chain import COMPUTED, Chain
+from clpipe.chain.families import ComputedChain
 from clpipe.chain.limits import field_limits
 from clpipe.chain.making import make_chain
 from clpipe.chain.registry import all_stages
@@ -121,6 +122,23 @@ def test_chains_of_one_structure_have_one_plan(families):
     assert one.without_noise_or_denoising().structure is not one.structure
     ops = [chain_ops(c, {s.name: s.arguments for s in c.steps}) for c in (one, other)]
     assert ops[0] == ops[1]
+
+
+@pytest.mark.parametrize("places", [("render",), ("render", "shutter", "dark_current")])
+def test_exposure_times_of_auto_exposure_are_one_family(places, families, monkeypatch):
+    """A stream has another time in each frame, and must not resolve its chain each time."""
+    general = {"camera": "canon-5d2", "shutter": {"flicker_depth": 0.3, "line_time": 1e-5}}
+    base = settings_from(general)
+    chains = []
+    for time in (0.01, 0.0112, 0.0131, 0.0147):
+        settings = overlay(base, {place: {"exposure_time": time} for place in places})
+        chains.append(make_chain(settings))
+        assert_equal(chains[-1], made(settings, monkeypatch))
+        assert chains[-1].optics.exposure_time == time == chains[-1].settings.render.exposure_time
+    assert [isinstance(chain, ComputedChain) for chain in chains] == [False, False, True, True]
+    other = overlay(base, {place: {"exposure_time": 0.02} for place in places})
+    with pytest.raises(RequestError, match="contradicts"):
+        make_chain(overlay(other, {"shutter": {"exposure_time": 0.03}}))
 
 
 def test_code_that_computes_beside_its_arguments_is_found_out(families, monkeypatch):

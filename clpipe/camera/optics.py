@@ -77,7 +77,7 @@ class Optics:
             first = places.setdefault(name, place)
             in_px = name in IN_PIXELS
             tolerance, least = (PIXEL_TOLERANCE, 0.01) if in_px else (LENGTH_TOLERANCE, 0.0)
-            if value is known or math.isclose(value, known, rel_tol=tolerance, abs_tol=least):
+            if value is known or _agree(value, known, tolerance, least):
                 continue
             raise KeyedError(
                 place, f"{place}: {value:g} contradicts {first}: {known:g}; set one of them"
@@ -149,6 +149,11 @@ class Optics:
             name: v for name, v in used_values.items() if v and getattr(self, name) is None
         }
         return replace(self, **missing) if missing else self
+
+
+def _agree(one: float, two: float, relative: float, absolute: float) -> bool:
+    """Like math.isclose, with operators only."""
+    return abs(one - two) <= max(relative * max(abs(one), abs(two)), absolute)
 
 
 NOT_NUMBERS = ("calibration", "has_lens_sensor", "places")

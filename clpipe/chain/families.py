@@ -167,11 +167,13 @@ def chain_of_family(
         RequestError: the chain cannot be built.
     """
     others, numbers = numbers_of(settings)
+    timeless = with_changes(settings.render, {TIME: None})
     key = (
         ends,
         Identity(camera),
         Identity(all_stages()),
         *(getattr(settings, name) for name in KEY_SETTINGS),
+        timeless,
         others,
         *((file, stamp_of(Path(file))) for file in settings.files()),
     )
@@ -185,32 +187,39 @@ def chain_of_family(
     return chain.with_settings(settings)
 
 
-KEY_SETTINGS = ("stages", "skip", "lens", "focal_length", "aperture", "focus_distance", "render")
+KEY_SETTINGS = ("stages", "skip", "lens", "focal_length", "aperture", "focus_distance")
+
+TIME = "exposure_time"  # of the render; auto exposure changes it from frame to frame
 
 
 def numbers_of(settings: Settings) -> tuple[Hashable, tuple[float, ...]]:
     """Return all values that are not floats, and the floats among the values that are set."""
     numbers, others = [settings.iso], []
+    time = settings.render.exposure_time
+    if time is not None:
+        numbers.append(time)
     for step, method in _methods_with_values(settings):
         table = settings.parameters[step]
         values = [getattr(method, name) for name in table]
         kinds = [None if type(value) is float else value for value in values]
         others.append((step, type(method), *table, *kinds))
         numbers += [value for value in values if type(value) is float]
-    return (tuple(settings.parameters), *others), tuple(numbers)
+    return (time is None, tuple(settings.parameters), *others), tuple(numbers)
 
 
 def with_numbers(settings: Settings, numbers: Numbers) -> Settings:
     """Return settings with other floats, in the order of :func:`numbers_of`."""
     remaining = iter(numbers)
-    iso = next(remaining)
+    iso, render = next(remaining), settings.render
+    if render.exposure_time is not None:
+        render = with_changes(render, {TIME: next(remaining)})
     parameters, validated = dict(settings.parameters), dict(settings.validated)
     for step, method in _methods_with_values(settings):
         table = settings.parameters[step]
         floats = {name: next(remaining) for name in table if type(getattr(method, name)) is float}
         parameters[step] = {**table, **floats}
         validated[step] = parameters[step], with_changes(method, floats) if floats else method
-    return replace(settings, iso=iso, parameters=parameters, validated=validated)
+    return replace(settings, iso=iso, render=render, parameters=parameters, validated=validated)
 
 
 def _methods_with_values(settings: Settings) -> list[tuple[str, Method]]:

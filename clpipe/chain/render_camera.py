@@ -67,7 +67,8 @@ class RenderCamera(BaseModel):
     @property
     def optics(self) -> dict[str, float]:
         """The optics that are set, by field name."""
-        return self.model_dump(exclude=POSE | SPECTRA, exclude_none=True)
+        found = {name: getattr(self, name) for name in type(self).model_fields}
+        return {k: v for k, v in found.items() if v is not None and k not in POSE | SPECTRA}
 
     def with_defaults(self, shot: Mapping[str, float]) -> "RenderCamera":
         """Return a copy whose fields that are None are filled from ``shot``, an image's own values.
