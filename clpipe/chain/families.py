@@ -167,7 +167,8 @@ def chain_of_family(
         RequestError: the chain cannot be built.
     """
     others, numbers = numbers_of(settings)
-    timeless = with_changes(settings.render, {TIME: None})
+    render = settings.render
+    timeless = render if render.exposure_time is None else with_changes(render, {TIME: None})
     key = (
         ends,
         Identity(camera),
